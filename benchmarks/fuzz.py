@@ -75,9 +75,11 @@ LONGEST = 2000  # characters of a message
 class Target:
     """One kind of artefact.
 
-    make: writes a small valid artefact into an empty folder. read: reads all of it with the
-    library's own reader, and returns a value that is equal for equal content. untellable: the
-    format has no checksum, so that no reader can know whether another result is damage.
+    make: writes a small valid artefact into an empty folder.
+    read: reads all of it with the library's own reader, and returns a value that is equal for equal
+        content.
+    untellable: the format has no checksum, so that no reader can know whether another result is
+        damage.
     """
 
     make: Callable[[Path], None]

@@ -44,8 +44,9 @@ OPENPI_OPTIONS = {"processor.prompt_length": 200, "embodiment.action.horizon": 5
 class Setup:
     """What is measured: sizes, device and how often.
 
-    backbone: a file of configs/backbone. batch: samples a process. processes: how many share an
-    update.
+    backbone: a file of configs/backbone.
+    batch: samples a process.
+    processes: how many share an update.
     """
 
     backbone: str

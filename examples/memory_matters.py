@@ -214,10 +214,13 @@ def learn(
     took.
 
     Args:
-        seconds: most CPU time, encoding included. steps: most updates. episodes: to learn from.
-        backbone: keys of the tiny backbone to change. config_dir: YAML files of your own.
-        every: updates between two measurements of the error on what it trains on. enough: error
-            that it stops at.
+        seconds: most CPU time, encoding included.
+        steps: most updates.
+        episodes: to learn from.
+        backbone: keys of the tiny backbone to change.
+        config_dir: YAML files of your own.
+        every: updates between two measurements of the error on what it trains on.
+        enough: error that it stops at.
     """
     wall, start = time.perf_counter(), time.process_time()
     torch.manual_seed(seed)

@@ -57,11 +57,11 @@ class MMEModel(nn.Module):
 
     Args:
         backbone: constructed with `integration.extra_experts()`.
-        memory: None for the policy without memory. integration: the base class `Integration` adds
-            nothing.
+        memory: None for the policy without memory.
+        integration: the base class `Integration` adds nothing.
         compute_dtype: bfloat16 runs matrix products under autocast over float32 weights.
-        transform_images: from views [b, v, 3, s, s] uint8, and in training the random numbers
-            [b, …] of their augmentation, to views in [−1, 1] as the backbone reads them.
+        transform_images: from views [b, v, 3, s, s] uint8, and in training the random numbers [b,
+            …] of their augmentation, to views in [−1, 1] as the backbone reads them.
 
     >>> sizes = BackboneConfig()  # doctest: +SKIP
     >>> integration = Modulator(sizes)  # doctest: +SKIP
@@ -101,8 +101,8 @@ class MMEModel(nn.Module):
         ones of the memory.
 
         Args:
-            batch: with `actions`, on the model's device. noise: as `training_noise` makes it, on
-                that device.
+            batch: with `actions`, on the model's device.
+            noise: as `training_noise` makes it, on that device.
             memory: memory tokens; by default those of `batch.history`.
             augmentation: random numbers [b, …] of the image augmentation; None augments nothing.
             metrics: receives what is worth logging, detached: `loss`, and if there are auxiliary
@@ -198,7 +198,8 @@ class MMEModel(nn.Module):
         the current ones do.
 
         Args:
-            batch: images uint8. augmentation: random numbers [b, …] of the image augmentation.
+            batch: images uint8.
+            augmentation: random numbers [b, …] of the image augmentation.
         """
         images = self.transform_images(batch.images, augmentation)
         past = batch.past
@@ -270,8 +271,8 @@ def masked_mean(losses: Tensor, counted: Tensor | None, weight: Tensor | None = 
     independent of the batch.
 
     Args:
-        counted: [b, h] bool; None counts all (`data.mask_padding`). weight: of each sample, [b]
-            (`data.weights`).
+        counted: [b, h] bool; None counts all (`data.mask_padding`).
+        weight: of each sample, [b] (`data.weights`).
     """
     if counted is None and weight is None:
         return losses.mean()

@@ -25,12 +25,15 @@ ENTRY_POINTS = "mme_vla.plugins"
 class Command:
     """A command of `mme-vla`.
 
-    module: its `main` runs the command. text: one line of help. config: the YAML file of the tree's
-    top level that configures it; empty for commands with options. processes: what it does where a
-    launcher starts several: `one` is refused, `shared` divides the work, `any` only reads.
-    reads_words: its `main` reads the command line itself, and takes no configuration. check:
-    `module:function` that reads the configuration, plain and resolved, before PyTorch is imported,
-    and raises a `UserError` on values that cannot work.
+    module: its `main` runs the command.
+    text: one line of help.
+    config: the YAML file of the tree's top level that configures it; empty for commands with
+        options.
+    processes: what it does where a launcher starts several: `one` is refused, `shared` divides the
+        work, `any` only reads.
+    reads_words: its `main` reads the command line itself, and takes no configuration.
+    check: `module:function` that reads the configuration, plain and resolved, before PyTorch is
+        imported, and raises a `UserError` on values that cannot work.
     """
 
     module: str
@@ -87,8 +90,10 @@ class WeightFormat:
 class Extension:
     """What a package adds to the library: names alone, so that reading it imports nothing.
 
-    parts: kind of `REGISTRIES` → name → module that registers it. commands: name → command.
-    configs: a folder of YAML files, searched after the library's. checkpoints: name → folder.
+    parts: kind of `REGISTRIES` → name → module that registers it.
+    commands: name → command.
+    configs: a folder of YAML files, searched after the library's.
+    checkpoints: name → folder.
     weight_formats: name → format that `weights` reads and writes.
     """
 
@@ -219,8 +224,8 @@ class Registry[T]:
         whatever goes wrong inside it keeps its own traceback.
 
         Args:
-            section: `name`, and the options. args, fixed: what the caller adds; no option may say
-                the same.
+            section: `name`, and the options.
+            args, fixed: what the caller adds; no option may say the same.
 
         Raises:
             UserError: the section is no mapping, its name is unknown, or the constructor does not

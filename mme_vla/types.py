@@ -114,7 +114,8 @@ class TensorStruct:
 class FrameBatch:
     """Consecutive frames of one camera, of which some have an image.
 
-    images: [n, H, W, 3] uint8. index: [n] int64, ascending; which of the `length` frames they show.
+    images: [n, H, W, 3] uint8.
+    index: [n] int64, ascending; which of the `length` frames they show.
     """
 
     images: np.ndarray

@@ -31,7 +31,8 @@ FAULTS = ("none", "error", "garbage", "text", "list", "no_actions", "shape", "na
 class Stream:
     """What a server was sent of one episode, and what it returned.
 
-    frames: images of the first camera, the conditioning video first. n_video: frames of that video.
+    frames: images of the first camera, the conditioning video first.
+    n_video: frames of that video.
     """
 
     goal: str = ""
@@ -55,7 +56,7 @@ class Stub:
     """A server's policy and its faults.
 
     fault: what is wrong with the replies from number `after` on, counted from 0 over all clients;
-    `times` of them are.
+        `times` of them are.
     requests: every message that came, decoded.
     """
 

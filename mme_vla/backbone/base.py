@@ -128,8 +128,10 @@ class Injection:
 
     blocks: the prefix in sequence order, the observation's own blocks among them.
     visibility: which block attends to which; rows for these blocks, for those beside the actions
-    and for `action`. hook: see `Hook`. condition: maps the condition [b, c] of the action expert's
-    norms to a changed one. beside: blocks that run with the actions, before them, in every step.
+        and for `action`.
+    hook: see `Hook`.
+    condition: maps the condition [b, c] of the action expert's norms to a changed one.
+    beside: blocks that run with the actions, before them, in every step.
     """
 
     blocks: Sequence[Block]
@@ -183,7 +185,8 @@ class Backbone(nn.Module):
             and `positions` (blocks at rotary positions of their own); and a memory, `past`
             (`Batch.past`).
         vision: the vision tower; its weights decide what a cache of its tokens holds.
-        image_size: side of the square images, in pixels. grid: side of a view's token grid.
+        image_size: side of the square images, in pixels.
+        grid: side of a view's token grid.
         vision_width: width d_vision of the tokens that a memory stores.
         horizon, action_dim: of the chunk [h, a].
         finetune_spec: the components of its parameters, by their names inside this module, and what
@@ -229,7 +232,8 @@ class Backbone(nn.Module):
         """The loss [b, h] of every step of every chunk, under the caller's autocast.
 
         Args:
-            batch: with `actions`. injection: the blocks of `embed` with memory added.
+            batch: with `actions`.
+            injection: the blocks of `embed` with memory added.
             noise: as `training_noise` makes it, on the batch's device.
         """
         raise NotImplementedError

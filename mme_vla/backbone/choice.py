@@ -30,7 +30,8 @@ class ChoiceHead(FlowHead):
     most probable component is taken.
 
     Args:
-        horizon, action_dim: of a chunk [h, a]. time_distribution: has no effect.
+        horizon, action_dim: of a chunk [h, a].
+        time_distribution: has no effect.
         choice: the columns of the letters, `embodiment.action.choice`.
         temperature: of the letters' softmax while sampling; 0 takes the best letter.
         deviation: standard deviation of the other numbers while sampling, in normalised units; 0

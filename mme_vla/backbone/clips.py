@@ -16,7 +16,9 @@ def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) 
     transformer's layers.
 
     Args:
-        layers: timm's `Block`s. x: [n, t, p, d]. visible: [n, t] bool, False on padding.
+        layers: timm's `Block`s.
+        x: [n, t, p, d].
+        visible: [n, t] bool, False on padding.
         every: interval of the layers that attend over time, at least the last one; the past is
             dropped above them.
 
@@ -45,7 +47,8 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
     """Attention over patches whose values are mixed over time, [n, t, p, d] → [n, t, p, d].
 
     Args:
-        attention: timm's `Attention`. before: [n, t, t] bool, which frames a frame attends to.
+        attention: timm's `Attention`.
+        before: [n, t, t] bool, which frames a frame attends to.
     """
     n, t, p = x.shape[:3]
     qkv = attention.qkv(x).unflatten(-1, (3, attention.num_heads, -1))

@@ -167,7 +167,9 @@ class FlowHead:
         """The velocity [b, h, a] from the network's output.
 
         Args:
-            predict: the network's output. times: [steps]. noise: as `sampling_noise` makes it.
+            predict: the network's output.
+            times: [steps].
+            noise: as `sampling_noise` makes it.
         """
         return predict
 
@@ -199,8 +201,9 @@ class FlowHead:
         v(x_i)/k + σ·ε_i.
 
         Args:
-            noise: x_0 [b, h, a]. increments: ε [b, k, h, a], standard normal. deviation: σ; 0 gives
-                plain Euler steps.
+            noise: x_0 [b, h, a].
+            increments: ε [b, k, h, a], standard normal.
+            deviation: σ; 0 gives plain Euler steps.
         """
         steps = increments.shape[1]
         times = self.times(steps, noise.device)

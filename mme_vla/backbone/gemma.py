@@ -67,7 +67,8 @@ class Segment(NamedTuple):
     """Neighbouring blocks of one expert, run as one matrix.
 
     update, gate: of the sublayer before, where the sum is left to the layer that reads it: it is
-    then one kernel with that layer's norm. Such a layer leaves its own last sum to the next one.
+        then one kernel with that layer's norm. Such a layer leaves its own last sum to the next
+        one.
     """
 
     expert: str
@@ -182,8 +183,11 @@ def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
 class Querying(NamedTuple):
     """A segment with queries, between its projection and the end of its layer.
 
-    rows: its place in the sequence. x: its tokens [b, n, d]. gate: of the attention's output.
-    condition: of the MLP's norm. hook: changes what the MLP reads.
+    rows: its place in the sequence.
+    x: its tokens [b, n, d].
+    gate: of the attention's output.
+    condition: of the MLP's norm.
+    hook: changes what the MLP reads.
     """
 
     segment: Segment
@@ -229,7 +233,8 @@ class JointBlock(nn.Module):
         """Run one layer.
 
         Args:
-            segments: this pass's tokens in sequence order. rope: their rotation.
+            segments: this pass's tokens in sequence order.
+            rope: their rotation.
             mask: additive [b, 1, n, past + n], or what another backend of attention reads.
             condition: what the action expert's norms are conditioned on: the time embedding [b, c]
                 or a modulation.
@@ -428,10 +433,12 @@ class JointTransformer(nn.Module):
         """Run blocks, after those of `past`.
 
         Args:
-            blocks: in sequence order. layout: of these blocks after this past.
+            blocks: in sequence order.
+            layout: of these blocks after this past.
             condition: time condition [b, c] of the action expert, or its modulations; unread
                 without that expert.
-            hook: the per-layer hook. past: an earlier pass's cache.
+            hook: the per-layer hook.
+            past: an earlier pass's cache.
             keep: whether to return a cache of `past` and this pass.
 
         Returns:

@@ -149,11 +149,11 @@ class Block:
     """A run of tokens that share a name, hence a row of the table, and an expert whose weights
     process them.
 
-    tokens: [b, n, d] at the expert's width. mask: [b, n] bool, False on padding.
+    tokens: [b, n, d] at the expert's width.
+    mask: [b, n] bool, False on padding.
     positions: [b, n] custom rotary positions, on the same axis as those of the other blocks; [b, n,
-    k] where a token
-        has k coordinates (time, row, column), which rotate interleaved angles; None counts its
-        tokens.
+        k] where a token has k coordinates (time, row, column), which rotate interleaved angles;
+        None counts its tokens.
     """
 
     name: str
@@ -193,7 +193,8 @@ def attention_mask(
 
     Args:
         queries, keys: blocks in sequence order.
-        query_mask: [b, q] bool. key_mask: [b, k] bool.
+        query_mask: [b, q] bool.
+        key_mask: [b, k] bool.
         table: the visibility table.
 
     Returns:
@@ -250,7 +251,8 @@ class MaskLayout(NamedTuple):
     Padding queries get the same mask as valid ones of their block; their output is ignored. This
     avoids fully masked rows, which produce NaN.
 
-    lengths: of the runs of queries, in sequence order. visible: [b, runs, k] bool.
+    lengths: of the runs of queries, in sequence order.
+    visible: [b, runs, k] bool.
     """
 
     lengths: tuple[int, ...]
@@ -263,8 +265,9 @@ class MaskLayout(NamedTuple):
         """The layout of blocks; neighbours with equal rows are one run.
 
         Args:
-            queries, keys: blocks in sequence order. valid: [b, k] bool, of the keys. table: the
-                visibility table.
+            queries, keys: blocks in sequence order.
+            valid: [b, k] bool, of the keys.
+            table: the visibility table.
         """
         runs: list[tuple[int, list[bool]]] = []
         for query in queries:
@@ -408,7 +411,8 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
     """Scaled dot-product attention with grouped queries: query head n reads key head n // (N/K).
 
     Args:
-        q: [b, q, N, h]; k, v: [b, k, K, h].
+        q: [b, q, N, h].
+        k, v: [b, k, K, h].
         mask: of `build_mask`; or additive [b, 1, q, k] in q's dtype; or bool with a key in every
             row; or None.
 

@@ -50,8 +50,8 @@ class VisionTower(nn.Module):
         they are.
 
         Args:
-            frame_mask: [n, t] bool, False on frames of clips that are not there. every: see
-                `PastViews`.
+            frame_mask: [n, t] bool, False on frames of clips that are not there.
+            every: see `PastViews`.
         """
         vit: Any = self.vit
         clips, images = images.shape[:-3], images.flatten(0, -4)
@@ -80,7 +80,8 @@ def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:
     """Pool [..., s², d] tokens of an s×s grid to [..., grid², d] over non-overlapping windows.
 
     Args:
-        tokens: row-major. grid: the new side; must divide s.
+        tokens: row-major.
+        grid: the new side; must divide s.
         pooling: `mean` as released, or `max` (paper, section 4.2).
     """
     side = int(tokens.shape[-2] ** 0.5)

@@ -175,9 +175,10 @@ def choose_subgoals(
     """The predictor, saying the kind of subgoal the policy was trained with unless the command line
     names one.
 
-    section: the section `subgoal` of the configuration. mode: `inline`, or `background`. device:
-    the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the
-    predictor.
+    section: the section `subgoal` of the configuration.
+    mode: `inline`, or `background`.
+    device: the policy's; a predictor with `device: auto` runs there too. None leaves the choice to
+        the predictor.
     """
     check_choice("subgoal_mode", mode, SUBGOAL_MODES)
     if section is None:

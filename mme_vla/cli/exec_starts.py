@@ -29,7 +29,9 @@ _UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
 class AnnotatedEpisode:
     """A recorded episode that says where its video ends.
 
-    goals: its wordings, lower-case. joints: [t, 7] radians. start: the first execution frame.
+    goals: its wordings, lower-case.
+    joints: [t, 7] radians.
+    start: the first execution frame.
     """
 
     goals: tuple[str, ...]

@@ -256,7 +256,9 @@ def argument_parser(command: str, text: str | None, examples: Sequence[str]) -> 
     """A parser for commands that read options instead of a configuration, with the same kind of
     `--help`.
 
-    command: as it is typed. text: what it does. examples: what is typed after it.
+    command: as it is typed.
+    text: what it does.
+    examples: what is typed after it.
     """
     listed = "\n".join(f"  {command} {example}".rstrip() for example in examples)
     return CommandParser(

@@ -33,7 +33,7 @@ class PolicyChoice:
 
     config: all of the command's configuration, plain. Without a checkpoint its model is built.
     server: a server that has the policy, in place of a checkpoint; it is asked for the robot
-    `embodiment`, and `execute` actions of a chunk are executed.
+        `embodiment`, and `execute` actions of a chunk are executed.
     """
 
     name: PathText

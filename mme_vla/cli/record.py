@@ -37,7 +37,8 @@ if TYPE_CHECKING:  # it imports the simulator, which is asked for first
 class RecordRun:
     """The keys of `configs/record.yaml`, where each is explained.
 
-    tasks: what `tasks` or `task` name. video: the section of `ConvertOptions`.
+    tasks: what `tasks` or `task` name.
+    video: the section of `ConvertOptions`.
     """
 
     tasks: str | tuple[str, ...]
@@ -176,8 +177,8 @@ def report_coverage(
 ) -> None:
     """Say which goals of the test split the recorded episodes lack, and write it as JSON.
 
-    plan: a recording that is there. workers: processes that build the split's scenes, which tell
-    their goals.
+    plan: a recording that is there.
+    workers: processes that build the split's scenes, which tell their goals.
     """
     specs = choose_episodes(tasks, None, "test")
     goals = []

@@ -173,7 +173,8 @@ def join_plugins(
 
     A list on the command line counts alone. The library's own files name no plugins.
 
-    trees: folders of YAML files, the library's first. overrides: those of the composition.
+    trees: folders of YAML files, the library's first.
+    overrides: those of the composition.
     """
     if not trees[1:] or any(word.lstrip("+").startswith("plugins=") for word in overrides):
         return

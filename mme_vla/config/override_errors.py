@@ -218,8 +218,10 @@ FORMS = (
 class Names:
     """What words of a command line may name.
 
-    keys: dotted ones of the configuration. groups: group → the names of its files. options: with
-    their dashes. checkpoints: names of those that ship with the library.
+    keys: dotted ones of the configuration.
+    groups: group → the names of its files.
+    options: with their dashes.
+    checkpoints: names of those that ship with the library.
     """
 
     keys: Sequence[str]
@@ -244,8 +246,9 @@ class Names:
 def unknown_option(option: str, words: Sequence[str], names: Names) -> UserError:
     """What to type instead of an option that there is not: settings are `key=value` words here.
 
-    option: as it was typed, `--steps` or `--steps=10`. words: the command line. names: what the
-    command knows.
+    option: as it was typed, `--steps` or `--steps=10`.
+    words: the command line.
+    names: what the command knows.
     """
     typed, _, value = option.partition("=")
     near_options = [known for known in names.options if known.startswith(typed)]

@@ -70,8 +70,9 @@ def plugins_of(config: Any, source: str) -> list[str]:
 def import_trusted(config: Any, source: str, trust: bool) -> None:
     """Import the plugins that a checkpoint names.
 
-    config: the checkpoint's configuration. source: the checkpoint, for messages. trust: the user
-    has said that what it names may run here.
+    config: the checkpoint's configuration.
+    source: the checkpoint, for messages.
+    trust: the user has said that what it names may run here.
     """
     names = plugins_of(config, source)
     installed = [module for module in _installed_parts(config) if module not in names]

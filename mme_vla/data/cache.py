@@ -43,7 +43,8 @@ def fingerprint(
     """Everything the tokens of a cache depend on.
 
     Args:
-        source: the dataset. spec: what a memory stores of each frame.
+        source: the dataset.
+        spec: what a memory stores of each frame.
         encoder: hash of the vision tower's weights (`policy.vision_fingerprint()`).
         dtype: `bfloat16` or `float32`.
     """
@@ -123,9 +124,10 @@ class VisionCache:
         """Open and check a cache.
 
         Args:
-            folder: where it is (`cache_folder`). source: the dataset it belongs to.
-            expected: the fingerprint it must have. command: what to tell the user to run, without
-                `rebuild=true`.
+            folder: where it is (`cache_folder`).
+            source: the dataset it belongs to.
+            expected: the fingerprint it must have.
+            command: what to tell the user to run, without `rebuild=true`.
         """
         check_fingerprint(folder, expected, command)
         self.folder = folder

@@ -271,10 +271,12 @@ def ensure_cache(
     is small.
 
     Args:
-        source, memory: whose tokens. encode: `policy.encode_frames`. encoder:
-            `policy.vision_fingerprint()`.
+        source, memory: whose tokens.
+        encode: `policy.encode_frames`.
+        encoder: `policy.vision_fingerprint()`.
         root: folder of all caches; None for `default_cache_root()`.
-        dtype: of the stored tokens. batch_size: frames encoded at once.
+        dtype: of the stored tokens.
+        batch_size: frames encoded at once.
         max_build_frames: datasets of more frames are not built here: that is worth a command of its
             own.
         command: that command, for messages.

@@ -30,8 +30,8 @@ def with_labels(
 ) -> HistoryTokens:
     """A selection, unbatched, with the labels of each token's frame.
 
-    labels: name → values [n] or [n, k] float32 of an episode's frames [n]. real: the recorded frame
-    of each frame of a transformed episode (`FrameMap.real`).
+    labels: name → values [n] or [n, k] float32 of an episode's frames [n].
+    real: the recorded frame of each frame of a transformed episode (`FrameMap.real`).
     """
     frames = (selection.positions[:, 0] * selection.mask).numpy().astype(np.int64)
     tokens = Labels()

@@ -41,7 +41,8 @@ log = logging.getLogger(__name__)
 class FrameTasks:
     """The task of every frame, as runs of rows that have the same one.
 
-    first: [r] int64, the first row of each run, ascending from 0. texts: [r], lower-case.
+    first: [r] int64, the first row of each run, ascending from 0.
+    texts: [r], lower-case.
     """
 
     first: np.ndarray
@@ -64,7 +65,8 @@ def check_consistency(
     """Compare everything that a dataset says twice.
 
     Args:
-        rows: of `read_index_columns`. table: of `open_table`; only first pictures are read from it.
+        rows: of `read_index_columns`.
+        table: of `open_table`; only first pictures are read from it.
 
     Returns:
         The task of every frame.
@@ -309,7 +311,8 @@ def compare_units(
     """Warn of numbers far too large for the unit that the robot's description gives them.
 
     Args:
-        names, units: of each number. scales: the greatest size of each, [w].
+        names, units: of each number.
+        scales: the greatest size of each, [w].
     """
     largest = [LARGEST_IN.get(unit.strip().casefold(), np.inf) for unit in units]
     beyond = scales > np.array(largest)

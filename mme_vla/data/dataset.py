@@ -32,9 +32,12 @@ class Step:
     """What is recorded of one step, before any processing.
 
     source, episode, index: where it lies; index counts the episode's frames, video included.
-    exec_start: the episode's first execution frame. goal: the task in words. subgoals: the texts of
-    this step by name. state: [s] float32. actions: [h, w] float32, the chunk, its last recorded
-    action repeated past the end. recorded: [h] bool, False on repeated actions.
+    exec_start: the episode's first execution frame.
+    goal: the task in words.
+    subgoals: the texts of this step by name.
+    state: [s] float32.
+    actions: [h, w] float32, the chunk, its last recorded action repeated past the end.
+    recorded: [h] bool, False on repeated actions.
     """
 
     source: int

@@ -52,13 +52,16 @@ log = logging.getLogger(__name__)
 class EpisodeSource:
     """The episodes of one dataset.
 
-    name: short name (the folder's, or `sample`). fps: frames per second.
-    robot: whose columns are read. columns: the dataset's column of each camera.
+    name: short name (the folder's, or `sample`).
+    fps: frames per second.
+    robot: whose columns are read.
+    columns: the dataset's column of each camera.
     state_names, action_names: what the dataset calls the numbers of the state and of the action;
-    may be empty. tasks: which task each frame has.
+        may be empty.
+    tasks: which task each frame has.
     scales: of the state and of the action, the greatest size of each number, [w] float64.
-    lengths: [e] int64, frames of each episode. exec_starts: [e] int64, its first execution frame (0
-    without a video).
+    lengths: [e] int64, frames of each episode.
+    exec_starts: [e] int64, its first execution frame (0 without a video).
     """
 
     def __init__(

@@ -23,8 +23,8 @@ def read_index_columns(
     that all files have.
 
     Args:
-        features: what info.json declares. flags: further columns of one whole number a row, read
-            where they are declared.
+        features: what info.json declares.
+        flags: further columns of one whole number a row, read where they are declared.
 
     Raises:
         UserError: a file lacks a declared flag, or a column holds something else than one number a

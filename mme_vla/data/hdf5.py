@@ -81,13 +81,14 @@ _REQUIRED = (
 class RawFrame:
     """One recorded time step. The observation was taken after the action of the same step.
 
-    front, wrist: [H, W, 3] uint8. state: [8] float32, seven joint angles and the first finger's
-    position. action: [8] as stored, seven absolute joint targets and the gripper command (−1 close,
-    1 open). is_demo: the step belongs to the conditioning video.
+    front, wrist: [H, W, 3] uint8.
+    state: [8] float32, seven joint angles and the first finger's position.
+    action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
+    is_demo: the step belongs to the conditioning video.
     subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as
-    released. rendered: the cameras that were rendered at this step; of the others `front` and
-    `wrist` repeat an earlier image
-        (the first one, before there is any).
+        released.
+    rendered: the cameras that were rendered at this step; of the others `front` and `wrist` repeat
+        an earlier image (the first one, before there is any).
     """
 
     front: np.ndarray

@@ -119,7 +119,7 @@ class Columns:
 
     pose: the same of the tool's pose, where actions are differences to it.
     tables: the columns that are read frame by frame; images are among them only where they are
-    stored in the tables.
+        stored in the tables.
     """
 
     cameras: Mapping[str, str]
@@ -342,7 +342,8 @@ def content_fingerprint(
     Numbers are never read by this hash: see `open_table`.
 
     Args:
-        root: the dataset's folder. parts: folders in it, or single files.
+        root: the dataset's folder.
+        parts: folders in it, or single files.
     """
     digest = sha256()
     for part in parts:
@@ -393,7 +394,8 @@ def parquet_files(root: Path, folder: str) -> list[Path]:
 class VideoSpans:
     """Where the images of each episode lie in the video files of a column, [e] each.
 
-    chunk, file: numbers of the file, int64. begin, end: seconds, float64; `end` may be missing.
+    chunk, file: numbers of the file, int64.
+    begin, end: seconds, float64; `end` may be missing.
     """
 
     chunk: np.ndarray
@@ -406,8 +408,9 @@ class VideoSpans:
 class EpisodeTable:
     """`meta/episodes`.
 
-    starts, lengths: [e] int64, rows of the tables. tasks: [e], those listed for each episode, none
-    where they are not listed. declared_lengths: the lengths once more, where they are written.
+    starts, lengths: [e] int64, rows of the tables.
+    tasks: [e], those listed for each episode, none where they are not listed.
+    declared_lengths: the lengths once more, where they are written.
     videos: by column.
     """
 
@@ -422,8 +425,10 @@ class EpisodeTable:
 class Description:
     """What is compared: the parts of a dataset that were read already.
 
-    root: its folder. info: meta/info.json. episodes: meta/episodes. videos, images: columns of the
-    cameras that are videos, and of those stored in the tables.
+    root: its folder.
+    info: meta/info.json.
+    episodes: meta/episodes.
+    videos, images: columns of the cameras that are videos, and of those stored in the tables.
     """
 
     root: Path

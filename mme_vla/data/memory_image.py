@@ -32,10 +32,11 @@ def memory_sheet(
     """Draw what is remembered at `step`.
 
     Args:
-        frames: [step + 1, H, W, 3] uint8. selected: [n, 2] of (frame, patch), as `Memory.select`
-            returns.
-        grid: side of a frame's patch grid. exec_start: first execution frame. title: one line
-            above.
+        frames: [step + 1, H, W, 3] uint8.
+        selected: [n, 2] of (frame, patch), as `Memory.select` returns.
+        grid: side of a frame's patch grid.
+        exec_start: first execution frame.
+        title: one line above.
 
     Returns:
         An image: remembered patches in colour, the rest of their frames dimmed, the current frame

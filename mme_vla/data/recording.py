@@ -18,7 +18,7 @@ class Recording:
     """One episode of a dataset.
 
     action_offset: actions between a frame and the first one that is decided there
-    (`data.action_offset`).
+        (`data.action_offset`).
     """
 
     source: EpisodeSource
@@ -88,7 +88,7 @@ class Recording:
         """Images of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
 
         required: frames that the memory camera shows beside the last, which all cameras do; None
-        for every frame.
+            for every frame.
 
         Raises:
             UserError: the robot reads depth, which a dataset has no columns for.
@@ -122,8 +122,8 @@ class Recording:
         """Observe frames start … stop − 1 in a running episode, which then offers the options that
         were recorded.
 
-        required: as for `views`. video: all of it as if it were a conditioning video of that
-        episode.
+        required: as for `views`.
+        video: all of it as if it were a conditioning video of that episode.
         """
         if stop <= start:
             return

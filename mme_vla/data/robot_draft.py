@@ -26,7 +26,9 @@ HORIZON, EXECUTE = 20, 16
 class RobotDraft:
     """The file, and what of it only its reader knows.
 
-    name: of the robot, and of the file. text: of the file. open_lines: the lines to check.
+    name: of the robot, and of the file.
+    text: of the file.
+    open_lines: the lines to check.
     """
 
     name: str

@@ -53,9 +53,10 @@ def compute_norm_stats(
         episodes: which of each dataset's episodes count; None counts all.
         horizon, action_offset: as in training; chunk step i of observation k is action k + offset +
             i.
-        seed: of the order. robot: says which numbers of an action are relative to the state.
-        every: count every execution step, in the data's order. extremes: keep the smallest and
-            largest values too.
+        seed: of the order.
+        robot: says which numbers of an action are relative to the state.
+        every: count every execution step, in the data's order.
+        extremes: keep the smallest and largest values too.
         exact: quantiles of all rows at once (linear interpolation), not of their histogram.
         video: count the conditioning video's steps too.
         narrow: what to do about a number whose range the values leave by far (`check_ranges`).

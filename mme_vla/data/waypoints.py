@@ -15,8 +15,8 @@ from mme_vla.utils import parse_json
 class Motions:
     """The motions of one episode's execution.
 
-    decisions: [m] int64, ascending; the last frame seen before each motion began. targets: [m, w]
-    float32.
+    decisions: [m] int64, ascending; the last frame seen before each motion began.
+    targets: [m, w] float32.
     """
 
     decisions: np.ndarray
@@ -47,8 +47,8 @@ def find_motions(rows: np.ndarray, first: int, letters: Sequence[int] = ()) -> M
 
     Args:
         rows: [t, w] of the execution frames; targets are NaN where no motion was noted yet.
-        first: number of their first frame. letters: of choices, which numbers are letters; a row
-            without one is no choice.
+        first: number of their first frame.
+        letters: of choices, which numbers are letters; a row without one is no choice.
     """
     if letters:
         begun: Any = np.flatnonzero(rows[:, list(letters)].any(1))
@@ -69,7 +69,8 @@ def known_poses(
     """Poses of every step from those that were noted; see `RawEpisode.pose_actions`.
 
     Args:
-        noted: [t, 7], NaN where there was none yet. exec_start: the first execution step.
+        noted: [t, 7], NaN where there was none yet.
+        exec_start: the first execution step.
         reached: the pose [7] that a step's action commands, by its number.
 
     Returns:

@@ -315,7 +315,8 @@ class ActionSpace:
         steps.
 
         Args:
-            actions: [..., h, w] as recorded. state: [..., s] when the chunk begins.
+            actions: [..., h, w] as recorded.
+            state: [..., s] when the chunk begins.
 
         Returns:
             [..., h, w].
@@ -355,7 +356,8 @@ class ActionSpace:
         0.
 
         Args:
-            actions: [..., w] absolute. options: what the episode offers.
+            actions: [..., w] absolute.
+            options: what the episode offers.
 
         Returns:
             [..., w], the point within the image; `actions` themselves where nothing is chosen.

@@ -86,8 +86,8 @@ def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
     the image.
 
     Args:
-        letter: `a` to `h`. point: y and x in pixels of the front image; empty for a choice that
-            needs none.
+        letter: `a` to `h`.
+        point: y and x in pixels of the front image; empty for a choice that needs none.
     """
     row = np.zeros(len(LETTERS) + 2, np.float32)
     row[LETTERS.index(letter)] = 1

@@ -21,9 +21,10 @@ _STRICT = ConfigDict(extra="forbid")
 class Camera:
     """One view of the scene.
 
-    name: the same from the simulator or the robot to the policy. key: its column in the dataset;
-    None for the usual names. augment: in training, `all` (crop, rotation, colour), `colour`, or
-    `none`. depth: whether the policy also reads how far each pixel is, and where the camera stands.
+    name: the same from the simulator or the robot to the policy.
+    key: its column in the dataset; None for the usual names.
+    augment: in training, `all` (crop, rotation, colour), `colour`, or `none`.
+    depth: whether the policy also reads how far each pixel is, and where the camera stands.
     """
 
     name: str
@@ -70,7 +71,8 @@ class _Section(BaseModel):
 class Embodiment:
     """A robot as a policy knows it.
 
-    cameras: in the order the network sees them. memory_camera: the one whose frames memories store.
+    cameras: in the order the network sees them.
+    memory_camera: the one whose frames memories store.
     fps: frames per second of cameras and control; None where it does not matter.
     conditioning_video: whether episodes may begin with a video, which a dataset then has to mark.
     """

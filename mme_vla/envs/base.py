@@ -325,11 +325,12 @@ def open_episode(
 
 
 class EpisodeEnv:
-    """One episode of a `gymnasium.Env` with the interface of `RoboMMEEnv`: what rollouts and `play`
-    use.
+    """One episode of a `gymnasium.Env` as rollouts and `play` use it: the `RoboMMEEnv` interface.
 
     Args:
-        environment: whose choices are offered. env: its gymnasium environment. spec: which episode.
+        environment: whose choices are offered.
+        env: its gymnasium environment.
+        spec: which episode.
         max_steps: steps until the status becomes `timeout`.
         by_choice: actions are `{"choice": letter}` among `environment.choices`, and all frames of
             one are returned.

@@ -30,11 +30,12 @@ COLUMNS = ("episode", "task", "fact", "value", "from", "to", "needed", "changed"
 class Fact:
     """Something that frames of an episode show and that it needs later.
 
-    name: of the fact; one that is shown again after a gap has two entries. value: what a scene with
-    another value of this fact would have differently. frames: the first and the last frame that
-    show it. needed: frames at which a decision begins that depends on it, ascending. changed: the
-    first frame that shows a fact which replaces it, or moves what it is about; None where there is
-    none.
+    name: of the fact; one that is shown again after a gap has two entries.
+    value: what a scene with another value of this fact would have differently.
+    frames: the first and the last frame that show it.
+    needed: frames at which a decision begins that depends on it, ascending.
+    changed: the first frame that shows a fact which replaces it, or moves what it is about; None
+        where there is none.
     """
 
     name: str
@@ -66,8 +67,8 @@ class Fact:
 class Candidates:
     """What the robot's next motion can go to, where the facts so far decide which is correct.
 
-    places: [n, d], in metres or any unit of the environment. correct: indices of the places that
-    the facts name.
+    places: [n, d], in metres or any unit of the environment.
+    correct: indices of the places that the facts name.
     """
 
     places: Sequence[Sequence[float]]
@@ -78,8 +79,8 @@ class Candidates:
 class VisibleFact:
     """A fact that the current frame shows.
 
-    subjects: names of what it is about. replaces: what earlier facts said about any of these does
-    not hold any more.
+    subjects: names of what it is about.
+    replaces: what earlier facts said about any of these does not hold any more.
     """
 
     value: str

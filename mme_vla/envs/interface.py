@@ -60,8 +60,10 @@ class EpisodeState:
     variables belong to the state as well. A replay without images takes about two milliseconds a
     control step. Can be pickled.
 
-    task, seed, difficulty, recovery, in_view, stress, row: the scene. action_space, max_steps: of
-    the environment. options: of the reset. actions: all that were given to `step` since.
+    task, seed, difficulty, recovery, in_view, stress, row: the scene.
+    action_space, max_steps: of the environment.
+    options: of the reset.
+    actions: all that were given to `step` since.
     """
 
     task: str

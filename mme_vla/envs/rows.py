@@ -97,7 +97,9 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
     """A row whose own fields are valid; those of `spec` are checked when its scene is built.
 
     Args:
-        value: what was read. where: what an error calls it. known: names of all tasks.
+        value: what was read.
+        where: what an error calls it.
+        known: names of all tasks.
 
     Raises:
         UserError: names the field.

@@ -202,9 +202,9 @@ class ProcessScore:
 
     done, of: sub-tasks of the execution that are done, and how many there are.
     broke: `wrong`, where the environment saw the wrong thing done; `stuck`, where the time ran out;
-    empty on success. operation: what the wrong thing was a mistake of: one of `OPERATIONS`, or a
-    motion (a slip, or another object than
-        the goal names). Empty for `stuck`, whose cause is unknown.
+        empty on success.
+    operation: what the wrong thing was a mistake of: one of `OPERATIONS`, or a motion (a slip, or
+        another object than the goal names). Empty for `stuck`, whose cause is unknown.
     subtask: the text of the one that was not done.
     """
 

@@ -16,8 +16,9 @@ class Pairing[Key: Hashable]:
 
     keys: of the episodes whose scenes are the same in all runs, in the order of the first run.
     unnamed: of these, how many have no digest in any run, so that task, number and seed alone say
-    that they are the same. other: task → how many were left out because their scenes differ. mixed:
-    task → because only some of the runs name the scene.
+        that they are the same.
+    other: task → how many were left out because their scenes differ.
+    mixed: task → because only some of the runs name the scene.
     """
 
     keys: tuple[Key, ...]

@@ -126,9 +126,9 @@ class _Receipt(TypedDict):
 class Verification(NamedTuple):
     """The result of checking a receipt, a line each.
 
-    differences: what is another here than in the receipt. not_compared: what there was nothing to
-    compare with, which is no agreement. notes: what may be another without any weight, such as the
-    type of CPU.
+    differences: what is another here than in the receipt.
+    not_compared: what there was nothing to compare with, which is no agreement.
+    notes: what may be another without any weight, such as the type of CPU.
     """
 
     differences: list[str]
@@ -148,7 +148,7 @@ class Verification(NamedTuple):
         """Compare a value of a receipt with the same here, part by part.
 
         absent_differs: whether a part that only one of them has is a difference; else it is not
-        compared.
+            compared.
         """
         old, new = flat({what: then}), flat({what: here})
         differences = []
@@ -185,8 +185,10 @@ def receipt(
     part.
 
     Args:
-        records: the file. run: what `run.json` holds. source: where the weights are from. renders:
-            whether the simulator of this library renders.
+        records: the file.
+        run: what `run.json` holds.
+        source: where the weights are from.
+        renders: whether the simulator of this library renders.
     """
     path = receipt_file(records)
     here = _conditions(policy.device.type == "cuda", renders, _extras_of(policy))

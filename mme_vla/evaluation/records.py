@@ -101,9 +101,10 @@ class EpisodeKey(NamedTuple):
 class Seconds:
     """Where an episode's wall time went.
 
-    sim: building and stepping the environment, without its images. render: those (0 where they
-    cannot be separated). policy: the episode's share of the policy's batches. total: from its
-    beginning to its end, waiting included.
+    sim: building and stepping the environment, without its images.
+    render: those (0 where they cannot be separated).
+    policy: the episode's share of the policy's batches.
+    total: from its beginning to its end, waiting included.
     """
 
     sim: Number = 0.0
@@ -273,7 +274,8 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     Different outcomes of one episode are refused: the same checkpoint and seed were evaluated
     twice. So are different scenes.
 
-    records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
+    records: of one or many files.
+    conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
     check_choice("conflicts", conflicts, ("refuse", "first", "last"))
     merged: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}

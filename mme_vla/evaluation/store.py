@@ -61,8 +61,8 @@ def claim_run(
     """Begin a run in `folder`, or continue with the one that is there.
 
     settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action
-    space, … notes: what does not (device, workers, versions); written down when the run begins,
-    never compared.
+        space, … notes: what does not (device, workers, versions); written down when the run begins,
+        never compared.
 
     Returns:
         What `run.json` holds. Several shards may claim the same folder at once: the first writes
@@ -261,7 +261,8 @@ class Claim:
     """One process's claim on an episode.
 
     records: name of the file that the process holds and writes its records to; None gives the
-    episode back. host, process: of the writer, for file systems without locks.
+        episode back.
+    host, process: of the writer, for file systems without locks.
     """
 
     records: str | None
@@ -288,8 +289,8 @@ class Claims:
         """Join the run. Gives back what an earlier process with the same file of records had not
         finished.
 
-        folder: of the run. records: the name of the file that this process holds and writes its
-        records to.
+        folder: of the run.
+        records: the name of the file that this process holds and writes its records to.
         """
         self.folder, self.records = folder, records
         self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}

@@ -83,7 +83,8 @@ class Integration(nn.Module):
         """Collect what enters the backbone for one chunk.
 
         Args:
-            observation: the backbone's blocks. memory: the memory's tokens; None without memory.
+            observation: the backbone's blocks.
+            memory: the memory's tokens; None without memory.
         """
         return Injection(
             self.blocks(observation, memory),

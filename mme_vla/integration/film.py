@@ -33,7 +33,8 @@ class FiLM(PooledIntegration):
         """Build it.
 
         Args:
-            backbone: sizes, which are not used. width: of the memory tokens and of the vector.
+            backbone: sizes, which are not used.
+            width: of the memory tokens and of the vector.
         """
         super().__init__(backbone)
         check_integer("integration.width", width)

@@ -22,8 +22,9 @@ token grid.
 class PastViewSpec:
     """Past views that a memory gives the backbone along with the current ones, of every camera.
 
-    frames: how many, the current one included. stride: frames between two of them. every: see
-    `PastViews`.
+    frames: how many, the current one included.
+    stride: frames between two of them.
+    every: see `PastViews`.
     """
 
     frames: int
@@ -125,7 +126,8 @@ class MemoryModule(nn.Module):
         a memory with past views returns the frames of these, which then show every camera.
 
         Args:
-            steps: current frames, video included. exec_start: as in `History`.
+            steps: current frames, video included.
+            exec_start: as in `History`.
 
         Returns:
             int64 [n], ascending, each once.
@@ -181,7 +183,8 @@ class MemoryModule(nn.Module):
         `forward`'s.
 
         Args:
-            histories: one per episode. streams: their states of `start_stream`, updated in place.
+            histories: one per episode.
+            streams: their states of `start_stream`, updated in place.
         """
         selections = [self.gather_selection(history, len(history) - 1) for history in histories]
         tokens: MemoryTokens = self(stack_history(selections))
@@ -323,7 +326,8 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
     ω_i = 10000^(−i/(w−1)), ω′_i = 1000^(−i/(w−1)), w = dim/6.
 
     Args:
-        positions: [..., 3] as `HistoryTokens.positions`. dim: a multiple of 6, at least 12.
+        positions: [..., 3] as `HistoryTokens.positions`.
+        dim: a multiple of 6, at least 12.
 
     Returns:
         [..., dim] float32, computed where the positions are.
@@ -442,8 +446,10 @@ class PerceptualMemory(MemoryModule):
         """Build the encoder.
 
         Args:
-            d_vision: width of a vision token. width: of a memory token, given by the integration.
-            budget: most memory tokens. storage: what is kept of each frame.
+            d_vision: width of a vision token.
+            width: of a memory token, given by the integration.
+            budget: most memory tokens.
+            storage: what is kept of each frame.
             position_dim, position_hidden: widths of the position features and their layer; None
                 follows `d_vision`.
             positions: of `POSITIONS`; None: `time_space`.

@@ -234,7 +234,7 @@ class CachedHistory(History):
     """Tokens read from disk: only the rows that a selection names are read.
 
     tokens: array-like [kept, patches, d_vision] (usually a memory map); bfloat16 is stored as its
-    uint16 bits.
+        uint16 bits.
     """
 
     def __init__(
@@ -322,8 +322,8 @@ class OnlineHistory(History):
         """Add frames in order.
 
         Args:
-            frames: images [n, H, W, 3] uint8. tokens: of those of `to_encode`, [k, patches,
-                d_vision].
+            frames: images [n, H, W, 3] uint8.
+            tokens: of those of `to_encode`, [k, patches, d_vision].
             rendered: offsets [n] of the images among the frames, of which there are `count`; by
                 default they are all.
         """
@@ -368,7 +368,8 @@ class OnlineHistory(History):
         """Score the next frames that have an image.
 
         Args:
-            frames: images [n, H, W, 3] uint8. offsets: their offsets [n] from the next frame.
+            frames: images [n, H, W, 3] uint8.
+            offsets: their offsets [n] from the next frame.
         """
         if self._scorer is None:
             return

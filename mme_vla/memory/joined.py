@@ -47,7 +47,8 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         """Build the members.
 
         Args:
-            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            d_vision: width of a vision token.
+            width: of a memory token, given by the integration.
             members: names, or sections with `name` and the memory's own options.
             budget: most memory tokens of all together. Members that name no budget share evenly
                 what the others leave.

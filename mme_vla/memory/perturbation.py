@@ -33,11 +33,14 @@ class Perturbation:
     """Changes nothing. A subclass overrides what it changes. It is a dataclass, so that its options
     are its fields.
 
-    dial: the option that `name:value` sets. neutral: its value without effect, at which a curve has
-    the plain run. drops: whether `repeats` may leave frames out. needs: what else a probe must have
-    for it, such as `recordings`. shows_video: whether the conditioning video is shown. renews:
-    whether the policy begins an episode anew at each decision, with what is shown of the frames so
-    far. lag: frames before the shown ones that `show` needs too.
+    dial: the option that `name:value` sets.
+    neutral: its value without effect, at which a curve has the plain run.
+    drops: whether `repeats` may leave frames out.
+    needs: what else a probe must have for it, such as `recordings`.
+    shows_video: whether the conditioning video is shown.
+    renews: whether the policy begins an episode anew at each decision, with what is shown of the
+        frames so far.
+    lag: frames before the shown ones that `show` needs too.
     """
 
     dial: ClassVar[str | None] = None
@@ -66,8 +69,8 @@ class Perturbation:
         frames so far.
 
         Args:
-            frames: what a probe collected, the current frame last. moment: what it knows of the
-                current step.
+            frames: what a probe collected, the current frame last.
+            moment: what it knows of the current step.
         """
         return frames
 
@@ -174,8 +177,9 @@ class Pause(Perturbation):
     every frame of them. In a recording one frame is repeated `frames` times more.
 
     at: which frame, from the first execution frame on; None: any frame in training, the first of
-    the execution in a probe. p: share of the training samples that have a pause; it has any length
-    from one frame to `frames`.
+        the execution in a probe.
+    p: share of the training samples that have a pause; it has any length from one frame to
+        `frames`.
     """
 
     frames: NonNegativeInt = 64
@@ -356,7 +360,8 @@ def split_word(text: str) -> Word | None:
 def build_perturbation(section: Mapping[str, Any], option: str, key: str) -> Perturbation:
     """Build a perturbation from a mapping with `name` and its options.
 
-    option: `TRAINING`, `ROLLOUT` or `PROBE`. key: of the value, for messages.
+    option: `TRAINING`, `ROLLOUT` or `PROBE`.
+    key: of the value, for messages.
 
     Raises:
         UserError: an unknown name or option, or a perturbation that this option has no hook for.

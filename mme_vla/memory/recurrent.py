@@ -48,9 +48,10 @@ def recurrent_frames(
     that.
 
     Args:
-        step: the current frame. exec_start: the first execution frame (0 without video). While the
-            video still runs, all frames before the current one count as video, so a finished
-            episode and a running one agree.
+        step: the current frame.
+        exec_start: the first execution frame (0 without video). While the video still runs, all
+            frames before the current one count as video, so a finished episode and a running one
+            agree.
         every: above 1 all this counts the frames 0 and k·every − 1 alone, and `step` comes after
             the newest of them. Two steps then read the same past frames, which demonstrations and
             episodes render once.
@@ -163,9 +164,10 @@ class Snapshot:
 class RecurrentStream:
     """How far one episode's recurrence has come.
 
-    snapshots: the last used is the last one. updates: frames taken since the episode began,
-    repeated ones included. last_step: that of the last decision. pace: frames from the decision
-    before it to that one.
+    snapshots: the last used is the last one.
+    updates: frames taken since the episode began, repeated ones included.
+    last_step: that of the last decision.
+    pace: frames from the decision before it to that one.
     """
 
     snapshots: list[Snapshot] = field(default_factory=list)
@@ -214,7 +216,7 @@ class RecurrentLayer(nn.Module):
     """How a frame changes the state, in float32 whatever surrounds it. Subclasses choose.
 
     window: most frames at the end of a list whose outputs `read` returns; None where `following`
-    may count further.
+        may count further.
     """
 
     window: int | None = None
@@ -230,8 +232,8 @@ class RecurrentLayer(nn.Module):
 
         Args:
             state: as `initial` or an earlier call gave it.
-            x: encoded frames [b, t, p, d], p tokens each. valid: [b, t]; a padding frame leaves the
-                state as it is.
+            x: encoded frames [b, t, p, d], p tokens each.
+            valid: [b, t]; a padding frame leaves the state as it is.
             following: frames that come after these before anything is read.
             statistics: also compute the numbers about each step, which cost time.
         """
@@ -276,7 +278,8 @@ class RecurrentMemory(MemoryModule):
         """Put the parts together.
 
         Args:
-            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            d_vision: width of a vision token.
+            width: of a memory token, given by the integration.
             layer: the recurrence, at width `hidden`.
             budget: memory tokens handed over.
             grid, pooling: a remembered frame is grid×grid tokens.
@@ -398,8 +401,9 @@ class RecurrentMemory(MemoryModule):
         """Let the next frame, or several whole frames, enter.
 
         Args:
-            features: [b, n, d_vision], n a multiple of a frame's tokens. positions: [b, n, 3].
-                mask: [b, n].
+            features: [b, n, d_vision], n a multiple of a frame's tokens.
+            positions: [b, n, 3].
+            mask: [b, n].
         """
         x = self.encoder(features, positions, mask)
         with float32_products(self.float32_products):

@@ -84,7 +84,8 @@ class TokenDrop(PerceptualMemory):
         """See `PerceptualMemory`.
 
         Args:
-            grid: side of a frame's token grid. stride: frames between two scored ones.
+            grid: side of a frame's token grid.
+            stride: frames between two scored ones.
             candidates: length of the list of best patches that is kept along an episode. With
                 `causal` it changes no choice and is checked alone.
             causal: only frames up to the current one compete for that list. False lets the whole

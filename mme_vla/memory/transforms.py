@@ -21,8 +21,8 @@ class FrameMap:
     """The one map from the frames of a transformed episode to those that were recorded.
 
     real: int64 [n], ascending; the recorded frame of each transformed one, up to the current one.
-    exec_start: the first transformed frame of the execution. transforms, rng: they made the map,
-    and perturb what is read.
+    exec_start: the first transformed frame of the execution.
+    transforms, rng: they made the map, and perturb what is read.
     """
 
     real: np.ndarray
@@ -54,8 +54,8 @@ def map_frames(
     """Apply transforms one after the other to the first `length` frames of an episode.
 
     Args:
-        rng: see `Perturbation.repeats`. keep: frames that stay whatever the transforms leave
-            out: those at which the policy decides.
+        rng: see `Perturbation.repeats`.
+        keep: frames that stay whatever the transforms leave out: those at which the policy decides.
     """
     real = np.arange(length)
     retained = np.asarray(keep, np.int64)

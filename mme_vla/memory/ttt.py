@@ -227,9 +227,10 @@ class TTT(RecurrentMemory):
         """See `RecurrentMemory` and `TTTLayer`.
 
         Args:
-            hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64. heads:
-                inner models.
-            base_rate: inner learning rate at the start. max_rate: its ceiling, per token and head.
+            hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64.
+            heads: inner models.
+            base_rate: inner learning rate at the start.
+            max_rate: its ceiling, per token and head.
             max_grad_norm: ceiling of an inner gradient's norm.
         """
         require(

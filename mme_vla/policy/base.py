@@ -38,7 +38,7 @@ class PolicyInfo:
     resamples: whether a chunk can be sampled any number of times at one step of an episode.
     max_running: most episodes that it can act in at the same time; None for any number.
     identity: what records call a policy that does not compute here; None for what its configuration
-    says.
+        says.
     server: what a receipt names of the server where the policy computes, its metadata and times so
         far; None for a policy that computes here.
     history_dtype: of stored vision tokens (`Policy.encode_frames`).
@@ -150,7 +150,8 @@ class Policy(nn.Module):
         so that a simulation renders no others.
 
         Args:
-            steps: [n] current frames, video included. exec_start: the first execution frame.
+            steps: [n] current frames, video included.
+            exec_start: the first execution frame.
 
         Returns:
             int64 [n], ascending and unique; None if any frame of any camera may be read.
@@ -177,8 +178,8 @@ class Policy(nn.Module):
         """Return the loss of a batch, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. noise: of `training_noise`, on the policy's device; sampled by
-                default.
+            batch: with `actions`.
+            noise: of `training_noise`, on the policy's device; sampled by default.
         """
         raise NotImplementedError
 
@@ -310,7 +311,8 @@ class Policy(nn.Module):
             dtype: of the weights. `bfloat16` halves the memory, for inference: compute is then
                 bfloat16 too, and no weight requires a gradient. `auto`: bfloat16 on a GPU if the
                 policy is made for it, else float32.
-            revision: branch, tag or commit of the repository. token: for private repositories.
+            revision: branch, tag or commit of the repository.
+            token: for private repositories.
             trust_plugins: import the modules that the checkpoint names under `plugins`. They run
                 code of its author.
             tokenizer: in place of the checkpoint's own, which is fetched from the hub only if it is
@@ -362,10 +364,12 @@ class Policy(nn.Module):
         repository's address.
 
         Args:
-            repo_id: `owner/name`; created if it does not exist. private: only if it is created now.
+            repo_id: `owner/name`; created if it does not exist.
+            private: only if it is created now.
             token: a write token; the one stored by `hf auth login` by default.
-            revision: the branch to commit to. message: of the commit. dtype, card: as for
-                `save_pretrained`.
+            revision: the branch to commit to.
+            message: of the commit.
+            dtype, card: as for `save_pretrained`.
         """
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder, dtype=dtype, card=card)
@@ -383,8 +387,10 @@ class Policy(nn.Module):
 class SelectedActions:
     """What a policy chose for n episodes.
 
-    batch: of `Policy.observation`. chunk: [n, h, a], in the network's units. actions: float32 [n,
-    h, w], as the embodiment executes them, without the steps of a chunk that lie in the past.
+    batch: of `Policy.observation`.
+    chunk: [n, h, a], in the network's units.
+    actions: float32 [n, h, w], as the embodiment executes them, without the steps of a chunk that
+        lie in the past.
     """
 
     batch: Any

@@ -30,8 +30,9 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
     """The memory of a configuration.
 
     Args:
-        d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's
-            own tokens.
+        d_vision: width of a vision token.
+        grid: side of a view's token grid.
+        width: of the memory's own tokens.
     """
     memory: MemoryModule = MEMORIES.build(section, d_vision=d_vision, width=width)
     check_grid(memory, grid)

@@ -191,8 +191,8 @@ class Episode:
 
         Args:
             frames: of the memory camera, [t, H, W, 3] uint8, in order, each once.
-            is_demo, actions: as for `observe`. states: [t, s]; only a memory of the robot's own
-                motion needs them.
+            is_demo, actions: as for `observe`.
+            states: [t, s]; only a memory of the robot's own motion needs them.
 
         Raises:
             UserError: a wrong dtype or shape, a video frame after execution has begun, a memory
@@ -220,7 +220,8 @@ class Episode:
         """Set the current view and state, adding nothing to memory.
 
         Args:
-            views: of every camera by its name, [H, W, 3] uint8. state: [s].
+            views: of every camera by its name, [H, W, 3] uint8.
+            state: [s].
 
         Raises:
             UserError: images or a state of another form, or a memory that reads past images of
@@ -322,8 +323,9 @@ class Episode:
 
         Args:
             actions: [n, w], as the embodiment executes them: the remaining ones of the chunk
-                before, the current one first. delay: how many of them are executed before the next
-                chunk is there; these count in full, the others less and less.
+                before, the current one first.
+            delay: how many of them are executed before the next chunk is there; these count in
+                full, the others less and less.
 
         Raises:
             UserError: actions of another form, more than a chunk, or a delay beyond them.

@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 class PolicyIdentity:
     """What tells a policy from others in records.
 
-    model: its name. checkpoint: its step, or a name. memory_budget: memory tokens; None where they
-    are `DEFAULT_BUDGET`. composition: `composition_digest` of its configuration. training: the
-    training that its weights are of. Both are None where they are not known.
+    model: its name.
+    checkpoint: its step, or a name.
+    memory_budget: memory tokens; None where they are `DEFAULT_BUDGET`.
+    composition: `composition_digest` of its configuration.
+    training: the training that its weights are of. Both are None where they are not known.
     """
 
     model: str
@@ -34,8 +36,8 @@ def identify_policy(policy: "Policy", name: str | None, source: str | None) -> P
     """The identity of a policy that this process has loaded.
 
     Args:
-        name: of the model; None for the policy's own. source: where the weights are from; None for
-            fresh ones.
+        name: of the model; None for the policy's own.
+        source: where the weights are from; None for fresh ones.
     """
     return PolicyIdentity(
         model=name or str(PolicySections.of(policy.config).name or "policy"),

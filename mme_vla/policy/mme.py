@@ -329,8 +329,8 @@ class MMEPolicy(NetworkPolicy):
             noise: as `sampling_noise` makes it, with a batch axis; of a flow also its noise [b, h,
                 a] alone.
             steps: Euler steps of a flow; 10 by default, as released.
-            generator: source of new noise, on the CPU. memory: memory tokens; by default those of
-                `batch.history`.
+            generator: source of new noise, on the CPU.
+            memory: memory tokens; by default those of `batch.history`.
         """
         if noise is None:
             noise = draw_noise(self, len(batch.prompt), generator)

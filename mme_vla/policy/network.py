@@ -36,7 +36,8 @@ class MemoryTower(NamedTuple):
     """The vision tower whose tokens a memory stores.
 
     pooled_tokens: images as the tower takes them, side of the grid, pooling → tokens [n, grid²,
-    width]. settings: what else its tokens depend on, for the fingerprint.
+        width].
+    settings: what else its tokens depend on, for the fingerprint.
     """
 
     tower: nn.Module

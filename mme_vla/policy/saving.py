@@ -334,8 +334,9 @@ def build_saved[P: "Policy"](
     """Build what the configuration of a checkpoint describes, on meta, adapters included.
 
     Args:
-        config: plain sections. source: where they are from, for messages. options: overrides of the
-            section `policy`.
+        config: plain sections.
+        source: where they are from, for messages.
+        options: overrides of the section `policy`.
     """
     sections = PolicySections.of(config, source)
     section = config.get("policy")

@@ -11,10 +11,13 @@ from mme_vla.errors import brief, require
 class PolicySections:
     """A policy's configuration. Each part's own class reads its section.
 
-    name: of the model. plugins: modules that register its parts. policy: the policy's class and
-    options. subgoal_text: how subgoals of a dataset become text. token_budget: most tokens of
-    memory and subgoal together.
-    adapters: LoRA adapters that the weights have. training: the training that the weights are of.
+    name: of the model.
+    plugins: modules that register its parts.
+    policy: the policy's class and options.
+    subgoal_text: how subgoals of a dataset become text.
+    token_budget: most tokens of memory and subgoal together.
+    adapters: LoRA adapters that the weights have.
+    training: the training that the weights are of.
     card: texts for the model card.
     """
 

@@ -84,11 +84,15 @@ class _About:
 class SelfCheck:
     """A synthetic history, the noise of one chunk, and the chunk that the policy predicted.
 
-    views: by the name of a camera, or of a reading beside its images, [t, …]. states: [t, s].
-    is_demo: [t]. past_actions: [t, w], those that led to the frames. noise: of
-    `Policy.sampling_noise`. chunk: [h, a] float32, in the network's units. actions: [h, w] float32,
-    the chunk as the robot executes it. options: of policies that choose. precision: of the weights
-    and the computation.
+    views: by the name of a camera, or of a reading beside its images, [t, …].
+    states: [t, s].
+    is_demo: [t].
+    past_actions: [t, w], those that led to the frames.
+    noise: of `Policy.sampling_noise`.
+    chunk: [h, a] float32, in the network's units.
+    actions: [h, w] float32, the chunk as the robot executes it.
+    options: of policies that choose.
+    precision: of the weights and the computation.
     """
 
     views: Mapping[str, np.ndarray]
@@ -132,9 +136,10 @@ class SelfCheck:
 class Comparison:
     """How far a loaded policy is from its self-check.
 
-    chunk: relative difference of the predicted chunk from the stored one. actions: that of the
-    actions which the stored chunk becomes here. tolerance: of `chunk`. recorded, current: precision
-    and device of the two.
+    chunk: relative difference of the predicted chunk from the stored one.
+    actions: that of the actions which the stored chunk becomes here.
+    tolerance: of `chunk`.
+    recorded, current: precision and device of the two.
     """
 
     chunk: float
@@ -301,8 +306,9 @@ def compare(policy: "Policy", folder: Path) -> Comparison | None:
     """Compare a loaded policy with the self-check of its checkpoint; None if it has none.
 
     Raises:
-        UserError: the file is damaged, or does not fit the policy. IncomparableError: the policy
-            raises an error of its own, such as one of a dtype that it cannot compute in.
+        UserError: the file is damaged, or does not fit the policy.
+        IncomparableError: the policy raises an error of its own, such as one of a dtype that it
+            cannot compute in.
     """
     check = read_self_check(folder)
     if check is None:

@@ -46,9 +46,10 @@ _TRAIN_WITHOUT_EFFECT = (
 class TrainingIdentity:
     """The training that a checkpoint is of.
 
-    seed: of fresh weights, data order and noise. recipe: digest of the settings that change an
-    update. data: digest of the contents of the datasets and of their split. weights: digest of a
-    checkpoint's weights.
+    seed: of fresh weights, data order and noise.
+    recipe: digest of the settings that change an update.
+    data: digest of the contents of the datasets and of their split.
+    weights: digest of a checkpoint's weights.
     """
 
     seed: Annotated[int, Range(-(2**63), 2**63)] | None = None
@@ -62,7 +63,8 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
     configuration.
 
     Args:
-        config: the plain configuration of a training. content: fingerprints of its datasets.
+        config: the plain configuration of a training.
+        content: fingerprints of its datasets.
     """
     train = config.get("train") or {}
     policy = config.get("policy") or {}

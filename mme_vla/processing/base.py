@@ -31,9 +31,11 @@ class Sample:
     """One training step as it is recorded, with the frames of the window before it.
 
     views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last.
-    states: [t, s]. goal: the task in words; subgoal: its current part, where the policy reads one.
-    past_actions: [n, w] the robot's own actions right before the chunk. actions: [h, w] the chunk,
-    absolute.
+    states: [t, s].
+    goal: the task in words.
+    subgoal: its current part, where the policy reads one.
+    past_actions: [n, w] the robot's own actions right before the chunk.
+    actions: [h, w] the chunk, absolute.
     """
 
     views: Mapping[str, np.ndarray]
@@ -50,13 +52,15 @@ class SampleSpec:
 
     kind: `steps` of an execution, or `keyframes` with depth.
     window: frames of an observation, the current one last; before the episode's start its first
-    frame is repeated. consecutive: the frames of the window follow each other; else they are those
-    at which the policy acted. full_chunks_only: leave out steps with fewer recorded actions ahead
-    than a chunk has. group_size: steps of one episode in a sample; more than 1 for policies that
-    train on sequences. cameras: whose images an item holds, in the embodiment's order; None for
-    all. history: from a step to the frames of the memory camera that an item holds, the current one
-    last; the other cameras
-        then have the current image alone. None for the window of all cameras.
+        frame is repeated.
+    consecutive: the frames of the window follow each other; else they are those at which the policy
+        acted.
+    full_chunks_only: leave out steps with fewer recorded actions ahead than a chunk has.
+    group_size: steps of one episode in a sample; more than 1 for policies that train on sequences.
+    cameras: whose images an item holds, in the embodiment's order; None for all.
+    history: from a step to the frames of the memory camera that an item holds, the current one
+        last; the other cameras then have the current image alone. None for the window of all
+        cameras.
     """
 
     kind: str = "steps"
@@ -72,10 +76,12 @@ class SampleSpec:
 class PromptSpec:
     """What a processor's prompts consist of.
 
-    encoder: what turns text into numbers, for reports. name: of the prompt format, for messages.
-    reads_subgoal: whether the prompt has a subgoal. past_actions: executed actions in it.
+    encoder: what turns text into numbers, for reports.
+    name: of the prompt format, for messages.
+    reads_subgoal: whether the prompt has a subgoal.
+    past_actions: executed actions in it.
     fingerprint: equal for two processors only if text means the same numbers to both; None if that
-    needs no check.
+        needs no check.
     """
 
     encoder: str
@@ -90,11 +96,12 @@ class StatsSpec:
     """What normalisation statistics are computed from.
 
     horizon: chunk steps of each observation, relative if the embodiment says so; None for the full
-    chunk. every: every execution step once, in the data's order; else shuffled batches without an
-    incomplete last one, as the
-        released code of π0.5 does.
-    extremes: keep the smallest and largest values too. exact: quantiles of all rows, not of a
-    histogram. bounds: what becomes −1 and 1, `quantiles` or `extremes`.
+        chunk.
+    every: every execution step once, in the data's order; else shuffled batches without an
+        incomplete last one, as the released code of π0.5 does.
+    extremes: keep the smallest and largest values too.
+    exact: quantiles of all rows, not of a histogram.
+    bounds: what becomes −1 and 1, `quantiles` or `extremes`.
     video: include the steps of the conditioning video.
     """
 
@@ -248,9 +255,10 @@ def motion_rows(
     """What a memory of the robot's own motion reads of t frames: [t, s + w + 1] float32.
 
     Args:
-        states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known:
-            bool [t], False where no action of the robot led to the frame; the values in `actions`
-            are ignored there.
+        states: [t, s] raw.
+        actions: [t, w] absolute, each the one that led to its frame.
+        known: bool [t], False where no action of the robot led to the frame; the values in
+            `actions` are ignored there.
 
     Returns:
         [state | action relative to it | known], normalised; actions are 0 where they are not known.

@@ -123,8 +123,8 @@ class Client:
         Raises:
             UserError: the server refuses the message, and says why. The episode continues where
                 nothing was changed; else the next request raises `ConnectionError`.
-            ConnectionError: the connection is lost. TimeoutError: no answer within `timeout`; the
-                connection is closed.
+            ConnectionError: the connection is lost.
+            TimeoutError: no answer within `timeout`; the connection is closed.
         """
         data = pack(message)
         if self._socket is None:
@@ -183,8 +183,8 @@ def open_socket(
     """Open a websocket without compression, for replies of at most `LARGEST_REPLY` bytes.
 
     Args:
-        open_timeout: seconds to wait for the handshake. pong_timeout: for the reply to a ping, and
-            for a server that reads nothing of what is sent.
+        open_timeout: seconds to wait for the handshake.
+        pong_timeout: for the reply to a ping, and for a server that reads nothing of what is sent.
 
     Raises:
         UserError: not an address, or the server refuses this client, or redirects it.

@@ -55,13 +55,14 @@ class MMEVLAModelServer(PredictModelServer):
 
     Args:
         checkpoint: folder, or owner/name of a hub repository; or a policy that is there already.
-        device: auto, cpu or cuda. dtype: of the weights; bfloat16 halves the memory.
+        device: auto, cpu or cuda.
+        dtype: of the weights; bfloat16 halves the memory.
         execute: actions of a chunk that are executed; by default the embodiment's.
         flow_steps: of an iterative head; by default its own.
         seed: of every episode's noise.
         trust_plugins: import the modules that the checkpoint names: their authors' code.
-        max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of
-            them.
+        max_batch_size: most sessions that act together.
+        max_wait_time: seconds to wait for more of them.
     """
 
     def __init__(

@@ -75,8 +75,9 @@ class PolicyServer:
     Args:
         policy: with normalisation statistics, in eval mode, on its device.
         settings: how to serve.
-        name: what metadata call the policy. trained: False says that its weights are fresh. source:
-            where they are from.
+        name: what metadata call the policy.
+        trained: False says that its weights are fresh.
+        source: where they are from.
     """
 
     def __init__(

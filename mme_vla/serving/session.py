@@ -31,7 +31,7 @@ class Session:
     same time.
 
     intact: whether the episode can go on. It can after a request that was carried out, or refused
-    before it changed anything, and not after one that failed half way.
+        before it changed anything, and not after one that failed half way.
     """
 
     intact = True

@@ -103,9 +103,9 @@ class CapturedSampling:
     """A policy's sampler behind graphs: one `GraphSampler` for each number of steps.
 
     Args:
-        sample: (batch, noise, steps, memory) → chunks, as `MMEModel.sample`. stamp: what graphs
-            depend on beside their inputs and the places of weights; where it changes they are
-            captured again.
+        sample: (batch, noise, steps, memory) → chunks, as `MMEModel.sample`.
+        stamp: what graphs depend on beside their inputs and the places of weights; where it changes
+            they are captured again.
     """
 
     def __init__(self, sample: Callable[..., Tensor], stamp: Callable[[], object]) -> None:

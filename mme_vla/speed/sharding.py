@@ -10,9 +10,9 @@ class ShardGroup(NamedTuple):
     """A module whose weights are gathered before its forward and freed after it.
 
     module: its weights are read in its forward alone, and it returns tensors or collections of
-    them. full: gather in float32 instead of bfloat16: modules that compute in float32, and towers
-    that hold such layers
-        without calling them.
+        them.
+    full: gather in float32 instead of bfloat16: modules that compute in float32, and towers that
+        hold such layers without calling them.
     """
 
     module: nn.Module

@@ -17,7 +17,8 @@ class SubgoalHistory:
 
     Texts decide, not points. Of equal texts the first one's points are kept.
 
-    entries: texts, points as `<bbox>`. points: of all entries in order, (row, column).
+    entries: texts, points as `<bbox>`.
+    points: of all entries in order, (row, column).
     """
 
     entries: list[str] = field(default_factory=list)
@@ -38,7 +39,8 @@ def hold_until(task: str, last: str | None) -> int:
     These are released rules, for tasks whose first presses must not be cut short.
 
     Args:
-        task: its name, such as `ButtonUnmask`. last: text of the last subgoal.
+        task: its name, such as `ButtonUnmask`.
+        last: text of the last subgoal.
     """
     if last is not None:
         for words, step in _HOLD_BY_SUBGOAL.get(task, {}).items():

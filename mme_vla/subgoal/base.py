@@ -45,8 +45,10 @@ class Subgoal:
 class Usage:
     """What a predictor has done so far, over all episodes.
 
-    calls: questions that a model answered. cached: answers from the cache.
-    input_tokens, output_tokens: as the model counts them. seconds: waited for answers.
+    calls: questions that a model answered.
+    cached: answers from the cache.
+    input_tokens, output_tokens: as the model counts them.
+    seconds: waited for answers.
     problems: unusable replies by kind.
     """
 
@@ -64,10 +66,13 @@ class Usage:
 class SubgoalEpisode:
     """The state of a predictor in one episode.
 
-    goal: the task in words, lower-case as in training. task: its name, empty if unknown.
+    goal: the task in words, lower-case as in training.
+    task: its name, empty if unknown.
     video: [t, H, W, 3] uint8, the conditioning video without the current frame; empty without one.
-    frame: the current front image [H, W, 3] uint8. step: actions executed so far.
-    info: what the environment reports beside the image. subgoal: the last prediction.
+    frame: the current front image [H, W, 3] uint8.
+    step: actions executed so far.
+    info: what the environment reports beside the image.
+    subgoal: the last prediction.
     query_step: the step of the last question; None while there was none.
     """
 
@@ -128,7 +133,7 @@ class SubgoalPredictor:
             each chunk.
 
     settings: the options that `build_predictor` built it from, as plain values; empty for one built
-    otherwise.
+        otherwise.
     """
 
     sees_video = True
@@ -151,8 +156,8 @@ class SubgoalPredictor:
         """Begin an episode.
 
         Args:
-            goal: the task in words. video: [t, H, W, 3] uint8, all frames before the first
-                execution frame.
+            goal: the task in words.
+            video: [t, H, W, 3] uint8, all frames before the first execution frame.
             task: its name (`ButtonUnmask`), for rules that hold for some tasks.
         """
         return self.episode_type(goal, video, task)

@@ -31,7 +31,8 @@ def read_image(path: Path) -> np.ndarray:
 class Clip:
     """Frames of a video that a model reads.
 
-    frames: [n, H, W, 3] uint8. indices: [n] their frame numbers in the video.
+    frames: [n, H, W, 3] uint8.
+    indices: [n] their frame numbers in the video.
     length: frames of the whole video.
     """
 
@@ -74,7 +75,8 @@ def sample_video(length: int, most: int = VIDEO_FRAMES) -> np.ndarray:
     """Sample an even number of frames of a video, as Qwen models do.
 
     Args:
-        length: frames of the video. most: sampled ones.
+        length: frames of the video.
+        most: sampled ones.
 
     Returns:
         int64 indices, evenly spaced from the first to the last frame.

@@ -25,7 +25,8 @@ class MemerEpisode(SubgoalEpisode):
     Args:
         reach: how many frames back the next question may show.
 
-    keyframes: frame number → image. queried: whether there was a question yet.
+    keyframes: frame number → image.
+    queried: whether there was a question yet.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str, reach: int) -> None:
@@ -59,7 +60,8 @@ class Memer(VLMPredictor):
     fails there).
 
     Args:
-        recent: frames shown besides the keyframes. stride: steps between two of them.
+        recent: frames shown besides the keyframes.
+        stride: steps between two of them.
         merge_distance: steps; keyframes at most so far apart are thinned out to their middle one.
     """
 

@@ -29,7 +29,8 @@ class VLMPredictor(SubgoalPredictor):
     Args:
         model: a repository on the hub, a folder, or `tiny`.
         adapter: LoRA weights to add; None for none.
-        max_new_tokens: longest answer. batch_size: questions answered at once.
+        max_new_tokens: longest answer.
+        batch_size: questions answered at once.
         device, dtype: where and how the model runs.
         vlm: a model that is loaded already, instead of all these.
     """

@@ -18,7 +18,8 @@ def check_backbone(name: str, **sizes: Any) -> None:
     that passed.
 
     Args:
-        name: the key in `BACKBONES`. sizes: small ones, as its YAML would give them.
+        name: the key in `BACKBONES`.
+        sizes: small ones, as its YAML would give them.
     """
     kind: type[Backbone] = BACKBONES[name]
     with torch.random.fork_rng(devices=[]):

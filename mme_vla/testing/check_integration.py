@@ -25,8 +25,9 @@ def check_integration(
     Prints a line for each that passed.
 
     Args:
-        name: the key in `INTEGRATIONS`. memory: the key of a memory to bring in. backbone: a file
-            of configs/backbone.
+        name: the key in `INTEGRATIONS`.
+        memory: the key of a memory to bring in.
+        backbone: a file of configs/backbone.
         options: the integration's own, as its YAML would give them.
     """
     sections = tiny_sections(f"{memory}_context", backbone)

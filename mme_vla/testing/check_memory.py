@@ -28,7 +28,8 @@ def check_memory(name: str, frames: int = 48, **options: Any) -> None:
     conditioning video.
 
     Args:
-        name: the key in `MEMORIES`. frames: length of the episode, at least 40.
+        name: the key in `MEMORIES`.
+        frames: length of the episode, at least 40.
         options: the memory's own, as its YAML would give them.
     """
     memory: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)

@@ -17,7 +17,9 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
     Nothing is rendered.
 
     Args:
-        task: the key in `TASKS`. seed, difficulty: of the scene. options: the task's own keywords.
+        task: the key in `TASKS`.
+        seed, difficulty: of the scene.
+        options: the task's own keywords.
     """
     first, second = (_demonstrated(task, seed, difficulty, options) for _ in range(2))
     assert first["goal"], "goals() must give at least one wording."

@@ -33,7 +33,7 @@ class SplitData:
     """The two sides of the split.
 
     train, val: datasets of training samples and of held-out ones: `TrainingDataset`, or what
-    `TRAINING_SETS` builds for this kind of samples. val is None where nothing is held out.
+        `TRAINING_SETS` builds for this kind of samples. val is None where nothing is held out.
     """
 
     train: Any

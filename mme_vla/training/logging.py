@@ -79,7 +79,8 @@ class Window:
         """The averages, and the speed; then begin anew.
 
         Args:
-            step: updates done. reduce: averages a tensor over all processes (`Accelerator.reduce`).
+            step: updates done.
+            reduce: averages a tensor over all processes (`Accelerator.reduce`).
         """
         averages: dict[str, Any] = {}
         for name, total in self._sums.items():

@@ -92,7 +92,8 @@ class Trainer:
         """Put the policy on its device, and back to where `run.checkpoint` left it.
 
         Args:
-            policy: with the parameters frozen that shall not learn. samples: the training split.
+            policy: with the parameters frozen that shall not learn.
+            samples: the training split.
             validation: held-out samples, if any.
             config: the plain configuration, saved with every checkpoint.
             facts: sections that join the policy's own configuration in checkpoints: its training

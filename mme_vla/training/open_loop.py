@@ -30,13 +30,15 @@ ALL = "all"
 class OpenLoop:
     """Chunks of n steps along one episode.
 
-    title: which episode of which data. steps: [n] frames they start at.
+    title: which episode of which data.
+    steps: [n] frames they start at.
     predicted, recorded: [n, h, w] absolute actions of the robot.
     valid: [n, h] False on actions beyond the episode's end.
     scale: [w] half the (q01, q99) range of each number in the training data; 1 where it never
         changes.
     baselines: name → [n, w], the action repeated over a chunk.
-    names, units: [w] texts. execute: actions of a chunk that are executed before the next one.
+    names, units: [w] texts.
+    execute: actions of a chunk that are executed before the next one.
     """
 
     title: str

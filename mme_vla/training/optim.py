@@ -287,8 +287,9 @@ def _adamw_and_average(
     averages by `share`, in place.
 
     Args:
-        means, squares: Adam's first and second moments. corrections, root_corrections: of their
-            bias, a number for each weight: 1 − β₁ᵗ and √(1 − β₂ᵗ).
+        means, squares: Adam's first and second moments.
+        corrections, root_corrections: of their bias, a number for each weight: 1 − β₁ᵗ and √(1 −
+            β₂ᵗ).
         factor, rate, share: of the clipping, of learning, and 1 − decay of the average.
         constants: β₁, β₂, ε and the weight decay.
     """

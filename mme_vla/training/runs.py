@@ -115,7 +115,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     """Decide where this run writes and where it starts; nothing is written yet.
 
     Args:
-        folder: of a new run. resume: None, `auto`, or the path of a run or one of its checkpoints.
+        folder: of a new run.
+        resume: None, `auto`, or the path of a run or one of its checkpoints.
         config: the composed configuration, plain.
     """
     if resume is None:
@@ -178,7 +179,8 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
     """Make sure that a resumed run has the data it began with.
 
     Args:
-        checkpoint: it continues from. now: `SplitData.content`.
+        checkpoint: it continues from.
+        now: `SplitData.content`.
     """
     then = read_state(checkpoint)["config"].get("data", {}).get("content")
     if then is not None and list(then) != list(now):

@@ -215,7 +215,7 @@ class TrainRun:
     """A training as a command line describes it: `configs/train.yaml`, read once.
 
     config: all of it as plain values. The sections of the model are read where its parts are built.
-    Checkpoints keep it whole.
+        Checkpoints keep it whole.
     """
 
     name: str

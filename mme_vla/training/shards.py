@@ -63,8 +63,8 @@ class ShardWriter:
         """Copy tensors to the CPU, then write them below `draft` in the background.
 
         Args:
-            draft: a folder that is there. finish: called by the first process when all have
-                written.
+            draft: a folder that is there.
+            finish: called by the first process when all have written.
         """
         self.wait()
         distributed.barrier(self._group)  # the folder is made
@@ -171,7 +171,8 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     """Read tensors in place.
 
     Args:
-        alone: this process reads all of them by itself. others: the checkpoint may hold more.
+        alone: this process reads all of them by itself.
+        others: the checkpoint may hold more.
     """
     folder = checkpoint / SHARDS
     files = shard_files(checkpoint)

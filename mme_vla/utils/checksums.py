@@ -60,8 +60,8 @@ class Sums:
         """Read the list.
 
         Args:
-            folder: a folder that may hold the list `name`. remedy: what the user can do about a
-                damaged file.
+            folder: a folder that may hold the list `name`.
+            remedy: what the user can do about a damaged file.
         """
         self.folder, self.name, self.remedy = folder, name, remedy
         path = folder / name
@@ -135,8 +135,9 @@ def checked_file(folder: Path, name: str, what: str = "file") -> Path:
     sum is right.
 
     Args:
-        folder: a folder that may hold `SHA256SUMS`. name: relative to it. what: the file is, for
-            the message.
+        folder: a folder that may hold `SHA256SUMS`.
+        name: relative to it.
+        what: the file is, for the message.
 
     Raises:
         UserError: it lies outside, is damaged, or is not listed; see `check_sums`.

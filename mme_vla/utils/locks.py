@@ -28,8 +28,9 @@ class FolderLock:
     Deleting the object unlocks the folder.
 
     Args:
-        folder: made if need be. what: its purpose, for the message. name: of the file, where
-            several share a folder.
+        folder: made if need be.
+        what: its purpose, for the message.
+        name: of the file, where several share a folder.
     """
 
     def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:

@@ -35,7 +35,8 @@ class VideoWriter:
     Args:
         target: a path, written in place (draw into a draft what is to appear whole), or a binary
             file.
-        fps: frames a second. crf, preset: the encoder's, quality and effort.
+        fps: frames a second.
+        crf, preset: the encoder's, quality and effort.
     """
 
     def __init__(
@@ -190,7 +191,9 @@ def contact_sheet(
     """Tiles in rows, each above its label.
 
     Args:
-        columns: tiles a row. title: one line above them. header: an image between title and tiles.
+        columns: tiles a row.
+        title: one line above them.
+        header: an image between title and tiles.
         side: pixels of a tile.
     """
     from PIL import Image, ImageDraw

@@ -108,7 +108,9 @@ def figure(
     """Open a figure of panels in rows under each other, in the project's look.
 
     Args:
-        size: width and height in inches. panels: how many. columns: panels beside each other.
+        size: width and height in inches.
+        panels: how many.
+        columns: panels beside each other.
     """
     from matplotlib.figure import Figure as Canvas
 

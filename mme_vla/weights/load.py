@@ -67,8 +67,8 @@ def load_weights(
 
     Args:
         source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
-        dtype: what the weights become, whatever they are stored in. revision, token: of a hub
-            repository.
+        dtype: what the weights become, whatever they are stored in.
+        revision, token: of a hub repository.
         base: what a run was trained on, where it holds its adapters alone.
     """
     kind = dtype_of(dtype)
@@ -114,8 +114,8 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
 class Start:
     """What a policy took from another's checkpoint.
 
-    taken, new: our names; new ones kept the values they had. left: the checkpoint's names that have
-    no place here.
+    taken, new: our names; new ones kept the values they had.
+    left: the checkpoint's names that have no place here.
     """
 
     taken: list[str]

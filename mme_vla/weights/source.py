@@ -77,7 +77,8 @@ VARIANTS = {
 class Source:
     """A checkpoint that was found.
 
-    format: a key of `formats()`. folder: what belongs to it lies here: configuration, statistics.
+    format: a key of `formats()`.
+    folder: what belongs to it lies here: configuration, statistics.
     files: its safetensors files; empty for an Orbax checkpoint.
     params: the Orbax arrays' folder, or their place in an archive.
     base: of a run that holds adapters alone, what they were trained on.

@@ -257,7 +257,8 @@ def pi05_of(policy: Policy) -> Pi05Backbone:
 def wrong_policy(policy: Policy, contents: str, change: str) -> UserError:
     """Make the error for a policy that a format does not hold.
 
-    contents: the methods it holds. change: what to set instead.
+    contents: the methods it holds.
+    change: what to set instead.
     """
     name = PolicySections.of(policy.config).name or "this"
     return UserError(

@@ -72,7 +72,8 @@ def prose(text: str, folder: str = "reference/commands") -> str:
     page of the documentation is a link.
 
     Args:
-        text: the comment. folder: of the page that shows it, under `docs/`.
+        text: the comment.
+        folder: of the page that shows it, under `docs/`.
     """
     pieces = text.split("`")  # every second one is in backticks, where only a bar means anything
     for i, piece in enumerate(pieces):

@@ -1,7 +1,7 @@
 """A griffe extension: docstrings of this library as griffe's Google parser and Markdown read them.
 
-The sources are dense: one line may describe several arguments, fields stand in a paragraph without
-a title, an example has no heading. Here each gets the form that becomes a table, a list or a block
+In the sources an entry may describe several arguments, fields stand in a paragraph without a title,
+and an example has no heading. Here each gets the form that becomes a table, a list or a block
 of code, and names in backticks become links.
 """
 
@@ -65,7 +65,8 @@ def rewritten(text: str, names: set[str]) -> str:
     """A docstring in the form that the parser reads.
 
     Args:
-        text: the docstring. names: what its entries may describe.
+        text: the docstring.
+        names: what its entries may describe.
     """
     blocks = []
     for block in re.split(r"\n\s*\n", text):
@@ -79,12 +80,12 @@ def _block(block: str, names: set[str]) -> str:
         code = re.sub(r" *# doctest: \+\w+", "", block)
         return f"```python\n{code}\n```"
     if head in SECTIONS:
-        return f"{head}\n{_entries(below, names)}"
+        return f"{head}\n{_entries(below)}"
     if head in OTHER_SECTIONS:
         return block
     match = ENTRY.match(head)
     if match and set(match[1].split(", ")) <= names:
-        return f"Attributes:\n{_entries(_indented(block), names)}"
+        return f"Attributes:\n{_entries(_indented(block))}"
     if head.endswith(":") and below and all(line.startswith("    ") for line in below.split("\n")):
         return f"{head}\n\n{_list(below)}"
     # A heading may follow sentences.
@@ -103,37 +104,26 @@ def _indented(block: str) -> str:
     return "\n".join(f"    {line}" for line in block.split("\n"))
 
 
-def _split(below: str, names: set[str] | None) -> list[tuple[str, str]]:
-    """Pairs of name and text; further entries within a line count if `names` has them."""
+def _split(below: str) -> list[tuple[str, str]]:
+    """Pairs of name and text; each entry begins on a line of its own."""
     joined: list[str] = []
     for line in below.split("\n"):
         starts = re.match(r" {4}(\*{0,2}\w+(?:, \w+)*): ", line)
-        # A continued line is indented deeper; some begin at the level of the entries.
         if starts or not joined:
             joined.append(line.strip())
         else:
             joined[-1] += " " + line.strip()
-    pairs: list[tuple[str, str]] = []
+    pairs = []
     for entry in joined:
-        name, _, rest = entry.partition(": ")
-        while names:
-            more = [
-                match
-                for match in re.finditer(r"(?<=[.;)`]) (\w+(?:, \w+)*): ", rest)
-                if set(match[1].split(", ")) <= names
-            ]
-            if not more:
-                break
-            pairs.append((name, rest[: more[0].start()].strip()))
-            name, rest = more[0][1], rest[more[0].end() :]
-        pairs.append((name, rest.strip()))
+        name, _, text = entry.partition(": ")
+        pairs.append((name, text.strip()))
     return pairs
 
 
-def _entries(below: str, names: set[str]) -> str:
+def _entries(below: str) -> str:
     """Entries of a section, each name on a line of its own."""
     lines = []
-    for names_together, text in _split(below, names):
+    for names_together, text in _split(below):
         for name in names_together.split(", "):
             lines.append(f"    {name}: {text}")
     return "\n".join(lines)
@@ -141,7 +131,7 @@ def _entries(below: str, names: set[str]) -> str:
 
 def _list(below: str) -> str:
     """Entries below a heading of their own as a Markdown list."""
-    return "\n".join(f"- `{name}`: {text}" for name, text in _split(below, None))
+    return "\n".join(f"- `{name}`: {text}" for name, text in _split(below))
 
 
 def linked(text: str, item: griffe.Object, targets: dict[str, str]) -> str:

@@ -1,5 +1,6 @@
 """The generated pages: API, configuration, commands, and files that pages link to."""
 
+import ast
 import inspect
 import json
 import re
@@ -40,6 +41,18 @@ def test_the_page_of_a_module_leaves_out_the_public_names() -> None:
     assert "- TensorStruct\n" in page and "- Batch\n" not in page
 
 
+def test_each_entry_of_a_docstring_begins_a_line() -> None:
+    second = re.compile(r"^\s*\w+(, \w+)*: [^`]*[.)] [a-z_]+(, [a-z_]+)*: ")
+    found = []
+    for path in sorted((REPOSITORY / "mme_vla").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ClassDef | ast.FunctionDef):
+                continue
+            lines = (ast.get_docstring(node) or "").splitlines()
+            found += [f"{path.name}: {line}" for line in lines if second.match(line)]
+    assert not found
+
+
 def test_docstrings_become_sections_lists_and_links() -> None:
     pytest.importorskip("griffe", reason="the extra `docs` is not installed")
     import docstrings
@@ -48,7 +61,8 @@ def test_docstrings_become_sections_lists_and_links() -> None:
     text = """Run it.
 
     Args:
-        tasks, episodes: as in the command. grid: side of a view's
+        tasks, episodes: as in the command.
+        grid: side of a view's
             token grid.
 
     >>> run(1)  # doctest: +SKIP

@@ -59,11 +59,13 @@ class Figure:
     """One number of a table, in percent.
 
     mean, std: over the complete trainings, or over the complete runs of one; None without one
-    (`std` needs two). interval: over episodes, and over trainings where there are several.
+        (`std` needs two).
+    interval: over episodes, and over trainings where there are several.
     runs, complete: runs there are, and those that have every episode of this figure.
-    done, expected: episodes of all runs. partial: rate of the episodes that are done, if no run is
-    complete. paper: what the paper reports here. full: whether the protocol has all episodes of the
-    tasks here, not only some.
+    done, expected: episodes of all runs.
+    partial: rate of the episodes that are done, if no run is complete.
+    paper: what the paper reports here.
+    full: whether the protocol has all episodes of the tasks here, not only some.
     """
 
     mean: float | None
@@ -136,8 +138,9 @@ class Method:
     """All runs of one model by one recipe, with the figures of every scope in
     `figures[kind][name]`.
 
-    table: its part of `record_table`. recipe, data: digests of what its trainings share; None where
-    records do not name them. event: what happened in the rollouts; None for the plain ones.
+    table: its part of `record_table`.
+    recipe, data: digests of what its trainings share; None where records do not name them.
+    event: what happened in the rollouts; None for the plain ones.
     repeated, flipped: see `Comparison`.
     """
 
@@ -242,9 +245,10 @@ def aggregate(
 ) -> Results:
     """Make all figures.
 
-    records: of any number of runs; they are merged here. protocol: its tasks are
-    `tasks_of(records)` by default. split: only these; needed if there are several. conflicts: see
-    `merge`.
+    records: of any number of runs; they are merged here.
+    protocol: its tasks are `tasks_of(records)` by default.
+    split: only these; needed if there are several.
+    conflicts: see `merge`.
     """
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))

@@ -25,20 +25,24 @@ from mme_vla.evaluation.results.statistics import (
 class Comparison:
     """`first` minus `second`, in percentage points, over the episodes that all runs of both have.
 
-    first_rate, second_rate, difference: means over tasks. first_solved, second_solved: of
-    `episodes`, a mean over runs. interval: of the difference
-    (`paired_interval`), with several trainings at least as wide as a paired bootstrap over episodes
-    and trainings. wins, losses: episodes that the first, or the second, solved in a larger share of
-    its runs; the rest are ties. p: exact two-sided test on wins and losses (McNemar's where each
-    has one run). corrected: by Holm, over all comparisons made together. significant: `corrected`
-    is below 1 − confidence. smallest_p: the smallest that p can be with so many episodes. testable:
-    whether that, corrected, is significant.
+    first_rate, second_rate, difference: means over tasks.
+    first_solved, second_solved: of `episodes`, a mean over runs.
+    interval: of the difference (`paired_interval`), with several trainings at least as wide as a
+        paired bootstrap over episodes and trainings.
+    wins, losses: episodes that the first, or the second, solved in a larger share of its runs; the
+        rest are ties.
+    p: exact two-sided test on wins and losses (McNemar's where each has one run).
+    corrected: by Holm, over all comparisons made together.
+    significant: `corrected` is below 1 − confidence.
+    smallest_p: the smallest that p can be with so many episodes.
+    testable: whether that, corrected, is significant.
     suites: difference and interval of each suite.
     repeated, flipped: episodes that were run twice with the same weights and seed, and those of
-    them that then ended otherwise; of both methods.
+        them that then ended otherwise; of both methods.
     paired: whether episodes are paired; if not, wins and losses are 0, and interval and p are of
-    the difference of two means (`unpaired_difference`). notes: which episodes were not paired, and
-    which have no digest of their scene; a sentence each. gaps: the former.
+        the difference of two means (`unpaired_difference`).
+    notes: which episodes were not paired, and which have no digest of their scene; a sentence each.
+    gaps: the former.
     """
 
     first: str

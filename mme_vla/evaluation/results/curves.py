@@ -105,10 +105,10 @@ def curves_of(
     A point counts the episodes that the model has at every place of the dial: one curve is of the
     same episodes.
 
-    records: merged. place: where a record lies; None for a record that lies on none, or at the
-    zero. same_scenes:
-        whether a dial leaves the scene as it is, so that only equal scenes are counted; one that
-        changes the scene keeps the episode's number and seed alone.
+    records: merged.
+    place: where a record lies; None for a record that lies on none, or at the zero.
+    same_scenes: whether a dial leaves the scene as it is, so that only equal scenes are counted;
+        one that changes the scene keeps the episode's number and seed alone.
     """
     table = record_table(records)
     table["run"] = [str(run) for run in table["run"]]
@@ -172,8 +172,9 @@ def curve_figure(
 ) -> str:
     """Success over an amount, a curve of every run, as SVG.
 
-    runs: name → amount, success in percent and its interval. label: of the amount. training: its
-    shaded range.
+    runs: name → amount, success in percent and its interval.
+    label: of the amount.
+    training: its shaded range.
     """
     labels = distinct_parts(list(runs))
     height = 3.0 + 0.2 * len(runs)

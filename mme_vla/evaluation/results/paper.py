@@ -19,9 +19,10 @@ FOLDER = Path(__file__).resolve().parents[2] / "assets" / "paper"
 class PaperMethod(NamedTuple):
     """A method of the paper, and what it is here.
 
-    name: as the data files spell it. label: as one writes it.
-    model, subgoal: this library's names, None if it has none. family: none, symbolic, perceptual,
-    recurrent or prior.
+    name: as the data files spell it.
+    label: as one writes it.
+    model, subgoal: this library's names, None if it has none.
+    family: none, symbolic, perceptual, recurrent or prior.
     """
 
     name: str
@@ -106,10 +107,11 @@ _COUNTED = Path(__file__).resolve().parents[2] / "assets" / "cost.csv"
 class ModelCost:
     """One model's cost; all but `prompt` (tokens) and `parameters` in FLOPs.
 
-    forward: the loss of one training sample. chunk: memory, prefix and ten Euler steps. memory: of
-    these, encoding the memory tokens from scratch. streamed: instead, a recurrent memory's update
-    by one frame (None for others). frames: the vision tower on those of `REPLAN` passing frames
-    that the memory stores.
+    forward: the loss of one training sample.
+    chunk: memory, prefix and ten Euler steps.
+    memory: of these, encoding the memory tokens from scratch.
+    streamed: instead, a recurrent memory's update by one frame (None for others).
+    frames: the vision tower on those of `REPLAN` passing frames that the memory stores.
     """
 
     model: str

@@ -32,10 +32,13 @@ from mme_vla.utils.pages import render
 class Section:
     """A box of a page.
 
-    figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables
-    behind a summary. images: name and WEBP in base64. terms: words that its tables and figure use,
-    and what each means. links: texts and addresses below the figures. half: whether it takes half
-    the width, beside another.
+    figure: SVG from `plots.svg`.
+    headed: whether tables stand under their titles.
+    folded: tables behind a summary.
+    images: name and WEBP in base64.
+    terms: words that its tables and figure use, and what each means.
+    links: texts and addresses below the figures.
+    half: whether it takes half the width, beside another.
     """
 
     title: str

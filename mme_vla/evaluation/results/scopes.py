@@ -26,7 +26,8 @@ class Task(NamedTuple):
     """The paper's facts of a task.
 
     memory: what has to be remembered: T(ime), S(pace), O(bject), P(rocedure).
-    video: whether a conditioning video comes first. steps: mean length of a demonstration.
+    video: whether a conditioning video comes first.
+    steps: mean length of a demonstration.
     """
 
     name: str
@@ -81,14 +82,14 @@ class Protocol:
     """What a whole run consists of, and how its figures are made.
 
     tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task; where some are
-    the benchmark's, of
-        these: tasks of one's own have figures of their own, beside the average.
+        the benchmark's, of these: tasks of one's own have figures of their own, beside the average.
     numbers: task → the numbers of its episodes that count, where these are not all `episodes`.
     task_suites: task → suite, of environments that are not RoboMME (`suites_of`).
     groupings: title → task → group, of environments that group their tasks in further ways
-    (`groupings_of`).
+        (`groupings_of`).
     errors: whether an episode that ended in an error is a `failure`, as in the official evaluation,
-    or `missing`. confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
+        or `missing`.
+    confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
     """
 
     tasks: tuple[str, ...] = PAPER_ORDER

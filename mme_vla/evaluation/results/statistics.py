@@ -115,7 +115,7 @@ def paired_interval(gaps: Mapping[str, np.ndarray], confidence: float = 0.95) ->
     no unequal pair nothing is known but that they are rare, which is what the first one states.
 
     gaps: of each task, first side minus second of every pair, −1 … 1. Pairs of several runs have
-    fractions, and count as so many pairs of single runs as their smaller spread is worth.
+        fractions, and count as so many pairs of single runs as their smaller spread is worth.
     """
     n_pairs = sum(len(values) for values in gaps.values())
     # A pair of a task with fewer pairs weighs more: the figure is a mean over tasks.
@@ -252,8 +252,8 @@ def resampled_means(
     of trainings.
 
     tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs
-    of a training: an episode is sampled with all of them, for all methods alike. Of one training
-    none is sampled.
+        of a training: an episode is sampled with all of them, for all methods alike. Of one
+        training none is sampled.
     """
     rng = np.random.default_rng(seed)
     n_trainings = [values.shape[1] for values in next(iter(tasks.values()))]

@@ -57,9 +57,11 @@ def is_out_of_reach(observation: Mapping[str, Any] | None, info: Mapping[str, An
 class Command:
     """What an environment executes next: actions, or a time for which the robot stays where it is.
 
-    actions: [n, w], executed one after the other; None with `hold`. hold: control steps for which
-    the robot stays where it is. subgoal: text in the video meanwhile. draw: the images that are
-    requested, by default all. Frames are counted from the reset on, and the newest is the last.
+    actions: [n, w], executed one after the other; None with `hold`.
+    hold: control steps for which the robot stays where it is.
+    subgoal: text in the video meanwhile.
+    draw: the images that are requested, by default all. Frames are counted from the reset on, and
+        the newest is the last.
     """
 
     actions: np.ndarray | None = None
@@ -73,16 +75,21 @@ class Report:
     """What an environment reports of a reset or of a command, beside its frames.
 
     status: `ongoing`, `success`, `fail`, `timeout` or `error`; None of an environment that gives
-    none. goal: the instruction; None if the environment named none yet. error: why the episode
-    failed, where the environment reports it. info: what the environment itself sends, for subgoal
-    predictors. options: of a robot that chooses, what there is to choose. scene: digest of the
-    scene.
-    executed: actions. frames: what these took, one each unless an action is a motion. held: the
-    action [w] that keeps the robot where it is after a command to hold it; None before the first
-    action. subtask: number of the execution's current sub-task from 1; 0 where the environment has
-    none. began: frames at which sub-tasks began.
-    process: where the chain of sub-tasks broke, for the record. oracle: the action [w] that the
-    task's script takes next, if it was requested. video: name of the finished video's file.
+        none.
+    goal: the instruction; None if the environment named none yet.
+    error: why the episode failed, where the environment reports it.
+    info: what the environment itself sends, for subgoal predictors.
+    options: of a robot that chooses, what there is to choose.
+    scene: digest of the scene.
+    executed: actions.
+    frames: what these took, one each unless an action is a motion.
+    held: the action [w] that keeps the robot where it is after a command to hold it; None before
+        the first action.
+    subtask: number of the execution's current sub-task from 1; 0 where the environment has none.
+    began: frames at which sub-tasks began.
+    process: where the chain of sub-tasks broke, for the record.
+    oracle: the action [w] that the task's script takes next, if it was requested.
+    video: name of the finished video's file.
     simulated_s, rendered_s: seconds since the last report.
     """
 
@@ -493,12 +500,15 @@ def make_rollout_env(
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
-    base: makes the environment itself from `task`, `split`, `episode` and `max_steps`
-    (`base_env`). max_steps: see `ChunkEnv`, or a function that gives it for a task. sessions:
-    unrelated episodes that the caller shows the policy before, as `split=stress:sessions=<n>`
-    requires; the scenes of such a split are those of the test split. videos: folder, and which
-    outcomes are kept: `all`, `success` or `failure`. run: its name, in the videos. robot,
-    max_actions: the policy's. oracle: see `ChunkEnv`.
+    base: makes the environment itself from `task`, `split`, `episode` and `max_steps` (`base_env`).
+    max_steps: see `ChunkEnv`, or a function that gives it for a task.
+    sessions: unrelated episodes that the caller shows the policy before, as
+        `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test
+        split.
+    videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
+    run: its name, in the videos. robot,
+    max_actions: the policy's.
+    oracle: see `ChunkEnv`.
     """
     if sessions:
         check_sessions(split, sessions)

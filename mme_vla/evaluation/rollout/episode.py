@@ -33,8 +33,9 @@ class EventCourse:
     """The events of one running episode.
 
     log: of each its text as `event`, and as `step` the control step at which it acted; None while
-    it has not. hold_steps: control steps for which events held the robot. holding: what holds it,
-    if its frames come next.
+        it has not.
+    hold_steps: control steps for which events held the robot.
+    holding: what holds it, if its frames come next.
     """
 
     def __init__(self, events: Sequence[Event]) -> None:
@@ -57,8 +58,8 @@ class EventCourse:
         which is then `holding`.
 
         Args:
-            step: control steps so far. subtask: number of the current sub-task, 0 where the
-                environment has none.
+            step: control steps so far.
+            subtask: number of the current sub-task, 0 where the environment has none.
         """
         self.holding = None
         for event, entry in zip(self._events, self.log, strict=True):
@@ -96,8 +97,10 @@ class RunningEpisode:
     Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of
     a conditioning video do not keep other episodes waiting.
 
-    subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals. events: what
-    happens to it.
+    subgoals: predicts the subgoal.
+    piece: frames to a piece.
+    trace: logs the subgoals.
+    events: what happens to it.
     """
 
     def __init__(

@@ -78,7 +78,8 @@ def choose_episodes(
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
     """Read `0/4` (the first of four), or the rank of this process under torchrun.
 
-    text: wins over the environment. environment: by default the process's own.
+    text: wins over the environment.
+    environment: by default the process's own.
     """
     if environment is None:
         environment = os.environ
@@ -126,12 +127,12 @@ class RunOptions:
 
     subgoals: predicts the subgoal, where the policy reads one.
     shard: which of how many processes this is; each takes the next episode that is free when it has
-    room (`store.Claims`).
+        room (`store.Claims`).
     source: where the weights are from; part of what makes a run the same.
     base: makes an environment with the benchmark's interface; importable by name.
     notes: kept in `run.json` and never compared.
     times_from: earlier records, of any policy: the longest episodes begin first, and say how long
-    all will take; by default those in the run's folder and in the folders beside it.
+        all will take; by default those in the run's folder and in the folders beside it.
     show_forecast: whether that is printed: of several arms on the same episodes by the first.
     name: what progress calls the run; None for its label.
     """
@@ -432,8 +433,9 @@ def facts_of(
 ) -> RunFacts:
     """What the records of a run have in common.
 
-    name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the
-    predictor.
+    name: of the model; None for the policy's own.
+    source: the checkpoint.
+    subgoal: name of the predictor.
     """
     identity = policy.info.identity or identify_policy(policy, name, source)
     return RunFacts(

@@ -30,7 +30,8 @@ from mme_vla.evaluation.store import find_records, read_records
 class RolloutProgress:
     """A bar on a terminal; anywhere else the lines alone. A context manager.
 
-    total: episodes of this process. before: records of those that an earlier run has finished.
+    total: episodes of this process.
+    before: records of those that an earlier run has finished.
     name: of the run, such as `nano · drop:all`: every line and the bar begin with it.
     """
 
@@ -172,7 +173,8 @@ class Durations:
         Environments run side by side while the policy acts: the slower of the two decides, and the
         longest episode is waited for in any case.
 
-        workers: environments at a time in a process. processes: that share the run.
+        workers: environments at a time in a process.
+        processes: that share the run.
         """
         if not self.records or not jobs:
             return None
@@ -184,8 +186,12 @@ class Durations:
 
 @dataclass(frozen=True)
 class Forecast:
-    """seconds: from now to the end. episodes: that are left. records: it is made from. at_once:
-    environments.
+    """How long the rest of a run takes.
+
+    seconds: from now to the end.
+    episodes: that are left.
+    records: it is made from.
+    at_once: environments.
     """
 
     seconds: float

@@ -29,8 +29,8 @@ LONGEST_VIDEO = 2_000  # frames; what is missing of a longer one is rendered by 
 class RenderPlan:
     """The images to render for each command to an environment; None requests everything.
 
-    policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered
-    (`draw`).
+    policy, subgoals: the readers.
+    settings: how often the policy acts, and whether all is rendered (`draw`).
     """
 
     def __init__(

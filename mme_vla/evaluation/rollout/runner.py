@@ -38,8 +38,8 @@ from mme_vla.subgoal import SubgoalPredictor
 class Waiting:
     """Episodes in the order they begin.
 
-    jobs: all that are left. claims: where other processes run the same ones; each then begins what
-    it could claim.
+    jobs: all that are left.
+    claims: where other processes run the same ones; each then begins what it could claim.
     """
 
     def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
@@ -131,8 +131,9 @@ class Workload:
 class Ending:
     """How an episode ended.
 
-    outcome: `success`, `fail`, `timeout` or `error`. error: what went wrong, where something says
-    so. again: whether the episode is tried once more.
+    outcome: `success`, `fail`, `timeout` or `error`.
+    error: what went wrong, where something says so.
+    again: whether the episode is tried once more.
     """
 
     outcome: str
@@ -168,7 +169,8 @@ class Rollout:
             subgoals: predicts the subgoal; None leaves it out of the prompt.
             subgoal_folder: where every subgoal is written down with its image; None keeps the
                 scores alone.
-            progress: is told of every record. workload: counts what the policy does.
+            progress: is told of every record.
+            workload: counts what the policy does.
         """
         self.policy = policy
         self.envs = envs

@@ -18,18 +18,23 @@ class RolloutSettings:
 
     seed: of the policy's noise; it does not reach the environments.
     max_steps: actions until the outcome is `timeout`; None: as many as the task allows
-    (`limit_of`).
+        (`limit_of`).
     max_actions: actions, whatever frames they take, until the outcome is `timeout`; None: the
-    policy's own limit. only_possible: by choices, offer no option whose every object is out of
-    reach. execute: actions of a chunk that are executed before the policy acts again; None: the
-    embodiment's number. env: name of the environment in the registry.
+        policy's own limit.
+    only_possible: by choices, offer no option whose every object is out of reach.
+    execute: actions of a chunk that are executed before the policy acts again; None: the
+        embodiment's number.
+    env: name of the environment in the registry.
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last
-    bit. encode_chunk: frames encoded before other episodes may act.
+        bit.
+    encode_chunk: frames encoded before other episodes may act.
     retries: how often an episode whose environment failed is tried again before the run continues
-    without it. timeout_s: seconds after which an environment that does not respond is replaced.
+        without it.
+    timeout_s: seconds after which an environment that does not respond is replaced.
     draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes
-    are the same. subgoal_log: whether every predicted subgoal is logged with its image.
+        are the same.
+    subgoal_log: whether every predicted subgoal is logged with its image.
     event: what happens in every episode, such as `pause:100@subtask:2`; None for nothing.
     """
 

@@ -29,10 +29,12 @@ class SubgoalScore:
 
     A subgoal is right when its text without points is; points are compared where the text is right.
 
-    chunks: times the policy acted. judged: of these, how often the environment had a subgoal to
-    compare with. right: how often the text was the environment's. points, distance: points
-    compared, and the sum of their distances in pixels of the front image. asked: questions to a
-    model. problems: unusable replies by kind.
+    chunks: times the policy acted.
+    judged: of these, how often the environment had a subgoal to compare with.
+    right: how often the text was the environment's.
+    points, distance: points compared, and the sum of their distances in pixels of the front image.
+    asked: questions to a model.
+    problems: unusable replies by kind.
     """
 
     chunks: int = 0
@@ -48,8 +50,8 @@ class SubgoalScore:
     ) -> None:
         """Count one subgoal.
 
-        predicted: the policy's subgoal; None while there is none. meant: the environment's; None
-        where it has none.
+        predicted: the policy's subgoal; None while there is none.
+        meant: the environment's; None where it has none.
         """
         self.chunks += 1
         self.asked += queried
@@ -166,7 +168,9 @@ class SubgoalTrace:
     `asked_step` is the step of its question. What an earlier try of the same episode left there is
     replaced.
 
-    kind: `simple` or `grounded`. folder: None keeps the score alone. name: of the episode.
+    kind: `simple` or `grounded`.
+    folder: None keeps the score alone.
+    name: of the episode.
     """
 
     def __init__(self, kind: str, folder: Path | None, name: str) -> None:
@@ -184,8 +188,8 @@ class SubgoalTrace:
     def add(self, episode: SubgoalEpisode, subgoal: Subgoal, latency_s: float) -> None:
         """Note the subgoal that the policy acts on now.
 
-        episode: as the predictor knows it, its last frame and report the current ones. latency_s:
-        seconds the policy waited for it.
+        episode: as the predictor knows it, its last frame and report the current ones.
+        latency_s: seconds the policy waited for it.
         """
         # Between two sub-tasks the environment names none, and the last one stays, as in training.
         self._meant = online_subgoal(episode.info, self._kind) or self._meant

@@ -24,8 +24,9 @@ class EpisodeVideo:
     The file gets its name, with the outcome, when the episode is over; until then it is a hidden
     file beside it.
 
-    path: of the video, from outcome and goal. kept: which outcomes are kept: `all`, `success` or
-    `failure`. run: name of the run, in every frame.
+    path: of the video, from outcome and goal.
+    save_on: which outcomes are kept: `all`, `success` or `failure`.
+    run: name of the run, in every frame.
     """
 
     def __init__(
@@ -48,8 +49,8 @@ class EpisodeVideo:
     ) -> None:
         """Append the images [H, W, 3] uint8 that all cameras took at one step.
 
-        goal, caption: the two lines below them; the run's name begins the second. demo: whether
-        they are of the conditioning video.
+        goal, caption: the two lines below them; the run's name begins the second.
+        demo: whether they are of the conditioning video.
         """
         line = " · ".join(part for part in (self._run, caption) if part)
         text = f"{goal or ''}\n{line}"

@@ -89,8 +89,9 @@ def run_audit(
     """Run what the folder lacks of an audit, and write its page and its JSON.
 
     Args:
-        jobs: the scenes, task by task. recordings: episodes to take contents, scenes and goals
-            from. references: name → folder of records, floors and ceilings.
+        jobs: the scenes, task by task.
+        recordings: episodes to take contents, scenes and goals from.
+        references: name → folder of records, floors and ceilings.
     """
     for name, mark in ((PAGE, MARK), (FIGURES, "conclusion")):
         require_earlier(folder / name, mark)

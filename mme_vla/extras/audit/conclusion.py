@@ -53,8 +53,10 @@ VERDICTS = {
 class Conclusion:
     """What an audit found.
 
-    verdict: of `VERDICTS`. sentences: the verdict and the losses that it follows from. resolution:
-    the smallest share of scenes whose loss can be told from chance; None where no loss can.
+    verdict: of `VERDICTS`.
+    sentences: the verdict and the losses that it follows from.
+    resolution: the smallest share of scenes whose loss can be told from chance; None where no loss
+        can.
     """
 
     verdict: str

@@ -55,8 +55,9 @@ class ClipEncoder(GoalEncoder):
     Args:
         source: the hub's name of a CLIP, or a folder as transformers writes them.
 
-    method: what it is for. tower: its class in transformers. size, option: how its configuration
-    and this library's call the width.
+    method: what it is for.
+    tower: its class in transformers.
+    size, option: how its configuration and this library's call the width.
     """
 
     method: ClassVar[str]
@@ -97,8 +98,8 @@ class ClipEncoder(GoalEncoder):
 class GoalProcessor(PolicyProcessor):
     """A processor whose prompt is what its encoder `text` makes of the goal; nothing else is read.
 
-    name: the processor's in `processor.json`. trusted: encoders that are taken on a checkpoint's
-    word.
+    name: the processor's in `processor.json`.
+    trusted: encoders that are taken on a checkpoint's word.
     """
 
     name: ClassVar[str]

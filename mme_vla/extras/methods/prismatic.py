@@ -160,9 +160,10 @@ class Prismatic(nn.Module):
         """Run the Llama.
 
         Args:
-            tokens: embeddings [b, n, d]. mask: additive [b, 1, n, n] in their dtype; it alone
-                decides the visibility.
-            positions: [b, n] int64. every_layer: return what stands before each layer too.
+            tokens: embeddings [b, n, d].
+            mask: additive [b, 1, n, n] in their dtype; it alone decides the visibility.
+            positions: [b, n] int64.
+            every_layer: return what stands before each layer too.
 
         Returns:
             Hidden states [b, n, d] after the final norm; with `every_layer` a tuple, the embeddings

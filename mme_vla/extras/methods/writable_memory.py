@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 class MemoryEntries:
     """One store of a writable memory.
 
-    entries: (time, content) in the order they are read. now: the current time, in the unit of these
-    times.
+    entries: (time, content) in the order they are read.
+    now: the current time, in the unit of these times.
     """
 
     name: str

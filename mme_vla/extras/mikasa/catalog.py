@@ -15,8 +15,9 @@ BULB, YCB = "bulb", "ycb"
 class Family:
     """Tasks of one kind.
 
-    memory: the kind of memory. tasks: name → step limit. needs: `BULB` or `YCB`, what its scenes
-    need beside the package.
+    memory: the kind of memory.
+    tasks: name → step limit.
+    needs: `BULB` or `YCB`, what its scenes need beside the package.
     frozen: whether no action has an effect while the cue is shown (except in tasks with `-Long`).
     """
 

@@ -39,7 +39,8 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         time: steps since the reset.
         frozen: first steps in which no action has an effect.
         cue_end: the first step at which the answer can be given.
-        known: what its frames show. log: the facts of those so far.
+        known: what its frames show.
+        log: the facts of those so far.
     """
 
     def __init__(self, task: str, render: bool, is_twin: bool = False) -> None:

@@ -133,8 +133,10 @@ class Reader(nn.Module):
         """The action tokens [b·r, h, d] after this layer.
 
         Args:
-            condition: [b·r, d]. k, v: of the context, [b, n, N, h]; mask: additive [b, 1, 1, n].
-                versions: r.
+            condition: [b·r, d].
+            k, v: of the context, [b, n, N, h].
+            mask: additive [b, 1, 1, n].
+            versions: r.
             hook: changes the MLP's input.
         """
         normed, gate = self.norm(x, condition)
@@ -204,8 +206,8 @@ class Context(NamedTuple):
     condition [b, d].
 
     pointing: what the pointer reads: tokens of the first view [b, n, D], and the share of each
-    class in what the goal selects [b, q, K]. None without a pointer. has_memory: whether an
-    integration adds one.
+        class in what the goal selects [b, q, K]. None without a pointer.
+    has_memory: whether an integration adds one.
     """
 
     keys_values: Tensor

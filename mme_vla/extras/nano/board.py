@@ -51,8 +51,9 @@ frame alone.
 class Row:
     """A row of the board.
 
-    facts: of its first training. is_local: whether it is the user's. recordings: digests of the
-    data that its trainings learned from.
+    facts: of its first training.
+    is_local: whether it is the user's.
+    recordings: digests of the data that its trainings learned from.
     """
 
     name: str
@@ -110,12 +111,15 @@ class Row:
 class Separation:
     """Whether memories differ on a task at a budget; success in percent.
 
-    memories: how many. lowest, mean, highest: of their success. deviation: standard one between
-    memories, less what trainings add. noise: between trainings of one memory, None with one
-    training each. floor, ceiling: of the best floor and of the best ceiling. p: of `homogeneity` of
-    all policies. repeated: how many memories have several trainings. p_repeated: of these over
-    trainings, None where they are too few for a p below 0.05. Both are corrected by Holm over the
-    tasks of the budget.
+    memories: how many.
+    lowest, mean, highest: of their success.
+    deviation: standard one between memories, less what trainings add.
+    noise: between trainings of one memory, None with one training each.
+    floor, ceiling: of the best floor and of the best ceiling.
+    p: of `homogeneity` of all policies.
+    repeated: how many memories have several trainings.
+    p_repeated: of these over trainings, None where they are too few for a p below 0.05. Both are
+        corrected by Holm over the tasks of the budget.
     """
 
     budget: str
@@ -526,9 +530,9 @@ def homogeneity(
     """P that memories which do not differ would differ as much: a permutation test of the variance
     between them.
 
-    groups: of each memory, outcomes [scenes, trainings]. over_trainings: trainings change places
-    between memories: they are what another training would change. Otherwise outcomes do within each
-    scene, which tests these policies alone.
+    groups: of each memory, outcomes [scenes, trainings].
+    over_trainings: trainings change places between memories: they are what another training would
+        change. Otherwise outcomes do within each scene, which tests these policies alone.
     """
     outcomes = np.concatenate(groups, 1)  # scenes × trainings of all memories
     sizes = [group.shape[1] for group in groups]

@@ -37,11 +37,16 @@ SUBGOALS = ("simple", "grounded")
 class Demonstration:
     """One episode of a task, with images of some frames.
 
-    length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its
-    decisions. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which a sub-task
-    begins, of the video too. subgoals: `simple` and `grounded` → what the simulator says at each
-    decision, as it says it at test time. carried_out: whether its motions were carried out one by
-    one, see `record`. facts: what its frames show; None in files of earlier versions.
+    length: frames.
+    exec_start: the first execution frame.
+    states: [length, 8] float32.
+    motions: its decisions.
+    images: camera → frame → [256, 256, 3] uint8.
+    boundaries: frames at which a sub-task begins, of the video too.
+    subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at
+        test time.
+    carried_out: whether its motions were carried out one by one, see `record`.
+    facts: what its frames show; None in files of earlier versions.
     """
 
     task: str
@@ -125,7 +130,8 @@ def _about(path: Path, file: Any) -> dict[str, Any]:
 class Scene:
     """A scene to demonstrate, and the folder of what comes of it.
 
-    cameras: those that render. choices: at which frames, for each memory that will train on it.
+    cameras: those that render.
+    choices: at which frames, for each memory that will train on it.
     carried_out, acts: see `record`.
     """
 
@@ -195,7 +201,8 @@ def frames_required(
     """Camera → the frames to render: those of the decisions, and at the front all that the memories
     read there.
 
-    decisions: frames [m] at which a motion begins. exec_start: number of frames of the video.
+    decisions: frames [m] at which a motion begins.
+    exec_start: number of frames of the video.
     choices: what the memories read; without one all decisions count.
     """
     decided: set[int] = set()

@@ -59,9 +59,11 @@ ORACLE = "oracle"
 class Rules:
     """How episodes are run; `max_choices` and `only_possible` are nano's own.
 
-    seed: of a policy's noise. max_steps: control steps until the outcome is timeout; 0: as many as
-    the split allows. max_choices: actions until it is; None: no limit for policies, `MAX_CHOICES`
-    for rows without a training. only_possible: offer no option whose every object is out of reach.
+    seed: of a policy's noise.
+    max_steps: control steps until the outcome is timeout; 0: as many as the split allows.
+    max_choices: actions until it is; None: no limit for policies, `MAX_CHOICES` for rows without a
+        training.
+    only_possible: offer no option whose every object is out of reach.
     shard: which of several processes this is, `0/2` or `1/2`; None: the only one.
     """
 
@@ -240,7 +242,7 @@ def run_checkpoint(
     simulator's.
 
     oracle: the memory chooses among the frames at which a sub-task began, as the probe's arm of
-    this name.
+        this name.
     """
     policy: Policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
     subgoal_source = None if subgoal_kind(policy) is None else ORACLE

@@ -54,11 +54,12 @@ def compose_policy(
 ) -> dict[str, Any]:
     """Compose one model at nano size, as plain values, and import its plugins.
 
-    model: a file of configs/model. memories: settings of each memory by its name, used where the
-    model has it. words: overrides that all models share, such as
-    `embodiment=robomme_waypoint_front`. extra_dirs: further trees, as `--config-dir` adds them.
-    plugins: modules that the model needs beside its own. budget: memory tokens, instead of those of
-    `memories`.
+    model: a file of configs/model.
+    memories: settings of each memory by its name, used where the model has it.
+    words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
+    extra_dirs: further trees, as `--config-dir` adds them.
+    plugins: modules that the model needs beside its own.
+    budget: memory tokens, instead of those of `memories`.
     """
     base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
     settings: dict[str, Any] = {}
@@ -89,10 +90,13 @@ def build(config: Mapping[str, Any]) -> MMEPolicy:
 class Training:
     """One training of a row.
 
-    row: what the page calls it. config: as `compose_policy` gives it, with the training's own seed.
-    settings, learning: the sections `train` and `learning`. folder: of the run. files:
-    demonstrations; one in `HELD_OUT` only measures. store: their tokens. tower_seed: of the tower's
-    weights where they are fresh.
+    row: what the page calls it.
+    config: as `compose_policy` gives it, with the training's own seed.
+    settings, learning: the sections `train` and `learning`.
+    folder: of the run.
+    files: demonstrations; one in `HELD_OUT` only measures.
+    store: their tokens.
+    tower_seed: of the tower's weights where they are fresh.
     """
 
     row: str

@@ -74,7 +74,7 @@ def check_reflection(p: float, space: ActionSpace, layout: str | None) -> None:
     """Raise UserError unless decisions can be learned at mirrored places with probability p.
 
     layout: of the tokens of a nano backbone's tower (`backbone.vision.layout`); None of another
-    backbone.
+        backbone.
     """
     require(0 <= p < 1, f"learning.reflect={p} must be a probability below 1.")
     require(
@@ -91,7 +91,8 @@ class Reflection:
     What is learned of one place then holds for others. The robot's joints stay as they are.
 
     p: probability of each of three changes: columns are mirrored, rows are, and both change places.
-    bounds: what the numbers of points [2] are normalised by. columns: of a point in an action.
+    bounds: what the numbers of points [2] are normalised by.
+    columns: of a point in an action.
     fixed: [n] bool, decisions that it leaves alone.
     """
 
@@ -106,7 +107,8 @@ class Reflection:
     ) -> "Reflection | None":
         """None with p=0, and for a memory of the robot's joints, which stay where they are.
 
-        goals: of all decisions. sides: words of goals that depend on where left or forward is.
+        goals: of all decisions.
+        sides: words of goals that depend on where left or forward is.
         """
         if not p or (policy.memory is not None and policy.memory.uses_proprio):
             return None
@@ -159,21 +161,20 @@ class Decisions(Dataset[int]):
     `collate`.
 
     batch: every decision, or every so many where the robot executes more motions of a chunk than
-    one; the tokens of
-        the current images (`Batch.view_tokens`) stand in place of the images.
+        one; the tokens of the current images (`Batch.view_tokens`) stand in place of the images.
     tasks: [n]; of which task each is.
     distant: [n] bool; decisions on a motion to another place than the last one's, which are hard
-    and few: each is
-        an item `oversample` times.
+        and few: each is an item `oversample` times.
     noise: spread of what is added whenever a decision is learned, so that few demonstrations are
-    learned by heart less:
-        to each number of a remembered token, `VIEW_NOISE` of it to those of current images, and
-        `JOINT_NOISE` of it to each joint (radians).
+        learned by heart less: to each number of a remembered token, `VIEW_NOISE` of it to those of
+        current images, and `JOINT_NOISE` of it to each joint (radians).
     token_noise: the same for tokens alone, in standard deviations of what each of their numbers is
-    over all decisions. reflection: puts the objects of all frames of a decision elsewhere whenever
-    it is learned. replay: selects the history of a decision anew in each epoch, where transforms
-    change the demonstrations' frames. balanced: repeat the decisions of tasks that have few, so
-    that all tasks are learned about equally often.
+        over all decisions.
+    reflection: puts the objects of all frames of a decision elsewhere whenever it is learned.
+    replay: selects the history of a decision anew in each epoch, where transforms change the
+        demonstrations' frames.
+    balanced: repeat the decisions of tasks that have few, so that all tasks are learned about
+        equally often.
     """
 
     epoch = 0
@@ -218,9 +219,11 @@ class Decisions(Dataset[int]):
     ) -> "Decisions":
         """Select what a policy reads at each decision.
 
-        policy: with statistics. demonstrations: with the tokens of their frames; alone they are
-        encoded now. min_distance: metres from which on a motion leads to another place. transforms:
-        of a demonstration's frames, chosen by `seed` and epoch. reflect_p, sides: see `Reflection`.
+        policy: with statistics.
+        demonstrations: with the tokens of their frames; alone they are encoded now.
+        min_distance: metres from which on a motion leads to another place.
+        transforms: of a demonstration's frames, chosen by `seed` and epoch.
+        reflect_p, sides: see `Reflection`.
         options: see the class.
         """
         items: list[dict[str, Any]] = []
@@ -346,8 +349,9 @@ NEAR = 0.05
 class ChoiceErrors:
     """Of held-out choices; distances are in shares of the image's side.
 
-    accuracy: task → share of right letters. points: task → share of points within `NEAR`, of tasks
-    that need any. off_by: median distance of points; None where none is needed.
+    accuracy: task → share of right letters.
+    points: task → share of points within `NEAR`, of tasks that need any.
+    off_by: median distance of points; None where none is needed.
     """
 
     accuracy: dict[str, float]

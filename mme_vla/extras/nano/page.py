@@ -47,10 +47,12 @@ def write_page(
 ) -> Path:
     """Write `page.md` and the plot beside it into the run's folder.
 
-    records: of each model, the one with memory first, and of the oracle planner. without: the one
-    without memory, which all others are compared with. minutes: of each stage, on the clock.
-    videos: one of a success, one of a failure, as far as there are such. runs: of each model, the
-    folders of its trainings. demonstrations: how many they learned from.
+    records: of each model, the one with memory first, and of the oracle planner.
+    without: the one without memory, which all others are compared with.
+    minutes: of each stage, on the clock.
+    videos: one of a success, one of a failure, as far as there are such.
+    runs: of each model, the folders of its trainings.
+    demonstrations: how many they learned from.
     """
     results, comparisons = compared(records, nano.task, nano.split, without)
     ends = ends_of(runs)

@@ -30,8 +30,9 @@ class Pointer(nn.Module):
     likelier.
 
     Args:
-        action_width: of an action token. width: of queries and keys. goals: q, queries that select
-            classes by the goal.
+        action_width: of an action token.
+        width: of queries and keys.
+        goals: q, queries that select classes by the goal.
     """
 
     def __init__(self, action_width: int, width: int, goals: int) -> None:
@@ -57,8 +58,9 @@ class Pointer(nn.Module):
         """Logits of m = n·K components, then their points, [b, h, 3·m].
 
         Args:
-            actions: [b, h, d]. tokens: of the tower, [b, n, ≥ 20·K]. selected: share of each class
-                in what the goal selects, [b, q, K].
+            actions: [b, h, d].
+            tokens: of the tower, [b, n, ≥ 20·K].
+            selected: share of each class in what the goal selects, [b, q, K].
             has_memory: whether the action tokens have read a memory.
         """
         presence, where = located(tokens.to(self.near.weight.dtype))
@@ -98,8 +100,8 @@ class Pointer(nn.Module):
         passes no gradient.
 
         Args:
-            actions: [b, h, d]. history: of the tower's tokens [b, n, ≥ 20·K], as memory selected
-                them.
+            actions: [b, h, d].
+            history: of the tower's tokens [b, n, ≥ 20·K], as memory selected them.
             selected: share of each class in what the goal selects [b, q, K].
         """
         with torch.no_grad():

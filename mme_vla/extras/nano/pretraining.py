@@ -39,10 +39,13 @@ MATCH_DISTANCE = 3.0  # centimetres between an object and its report at most
 
 @dataclass(frozen=True)
 class PretrainSettings:
-    """steps: updates. batch_size: images each. lr: peak learning rate, on a cosine to zero after a
-    short warm-up.
+    """How the tower is pretrained.
 
-    save_every: updates between two drafts. seed: of everything random.
+    steps: updates.
+    batch_size: images each.
+    lr: peak learning rate, on a cosine to zero after a short warm-up.
+    save_every: updates between two drafts.
+    seed: of everything random.
     """
 
     steps: int = 1300
@@ -56,8 +59,10 @@ class PretrainSettings:
 class Scenes:
     """Images [n, 3, s, s] uint8, and the visible objects of all.
 
-    owners: [m], each object's image. classes: [m]. centres: [m, 3], metres in the world. places:
-    [m, 2], their column and row in the image, 0 … 1.
+    owners: [m], each object's image.
+    classes: [m].
+    centres: [m, 3], metres in the world.
+    places: [m, 2], their column and row in the image, 0 … 1.
     """
 
     images: Tensor
@@ -125,7 +130,9 @@ def label_cells(
     two of a class are near, the nearer one counts.
 
     Args:
-        batch: each object's image. classes: [m]. places: column and row in the image [m, 2], 0 … 1.
+        batch: each object's image.
+        classes: [m].
+        places: column and row in the image [m, 2], 0 … 1.
         shape: images b and cells g a side.
     """
     images, side = shape
@@ -160,7 +167,8 @@ def augmented(
     time.
 
     Args:
-        images: [b, 3, s, s]. places: [m, 2] in them, of the images `batch` [m].
+        images: [b, 3, s, s].
+        places: [m, 2] in them, of the images `batch` [m].
     """
     right, down = (int(n) for n in rng.integers(-SHIFT, SHIFT + 1, 2))
     side = images.shape[-1]
@@ -181,8 +189,9 @@ def tower_loss(
     labelled cell.
 
     Args:
-        logits, offsets: of `PlaceTower.locate`. presence, places: of `label_cells`. weights: of the
-            classes [K].
+        logits, offsets: of `PlaceTower.locate`.
+        presence, places: of `label_cells`.
+        weights: of the classes [K].
     """
     each = weights[:, None, None] * (1 + (POSITIVE - 1) * presence)
     cross_entropy = functional.binary_cross_entropy_with_logits(
@@ -205,7 +214,9 @@ def pretrain(
     weights.
 
     Args:
-        tower: with fresh weights. files: scenes to learn from. held_out: those that only measure.
+        tower: with fresh weights.
+        files: scenes to learn from.
+        held_out: those that only measure.
         folder: of the run.
     """
     from safetensors.torch import save_file
@@ -286,9 +297,10 @@ def _batch_loss(
 class ClassResult:
     """One class on held-out scenes.
 
-    places: visible objects. reports: of the class. errors: centimetres between each object and its
-    report, of those that are found: an object and a report belong together once, the nearest first,
-    up to `MATCH_DISTANCE`.
+    places: visible objects.
+    reports: of the class.
+    errors: centimetres between each object and its report, of those that are found: an object and a
+        report belong together once, the nearest first, up to `MATCH_DISTANCE`.
     """
 
     places: int
@@ -303,7 +315,8 @@ def find_objects(presence: Tensor, offsets: Tensor) -> list[tuple[float, float]]
     are one object, at their mean, if they come to `VOTES`.
 
     Args:
-        presence: [g, g]. offsets: [2, g, g].
+        presence: [g, g].
+        offsets: [2, g, g].
     """
     rows, columns = (presence > FLOOR).nonzero().unbind(1)
     votes, order = presence[rows, columns].sort(descending=True)

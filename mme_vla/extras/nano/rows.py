@@ -37,11 +37,16 @@ _SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "se
 class Trained:
     """What `trained.json` holds; a row without a training, as of random choices, has no numbers.
 
-    row: name of the row. kind: floors and ceilings bracket the policies. trained: whether there was
-    a training. seed, recipe, data, weights: its `TrainingIdentity`. demonstrations: their number
-    for each task. budget: memory tokens. parameters: learned ones. update_s: CPU seconds of one
-    update, with its share of validation and checkpoints. update_flops: of one update. cpu_minutes:
-    of a training that was not interrupted.
+    row: name of the row.
+    kind: floors and ceilings bracket the policies.
+    trained: whether there was a training.
+    seed, recipe, data, weights: its `TrainingIdentity`.
+    demonstrations: their number for each task.
+    budget: memory tokens.
+    parameters: learned ones.
+    update_s: CPU seconds of one update, with its share of validation and checkpoints.
+    update_flops: of one update.
+    cpu_minutes: of a training that was not interrupted.
     """
 
     row: str
@@ -70,7 +75,8 @@ class Trained:
 class Training:
     """One training and its episodes, numbered from 0 within each task.
 
-    rules: action space and limits of an episode. is_local: whether it is the user's.
+    rules: action space and limits of an episode.
+    is_local: whether it is the user's.
     """
 
     folder: Path
@@ -112,7 +118,7 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
     seeds.
 
     local: folders of the user, whose rows are called `<name> (yours)` where the others have the
-    name.
+        name.
 
     Raises:
         UserError: a folder that does not keep the schema, two trainings with the same weights or

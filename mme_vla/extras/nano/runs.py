@@ -286,7 +286,8 @@ def record_all(
     """Demonstrate until there are as many as wanted, each in a file of its own; the files, task by
     task.
 
-    choices: what the memories that will train on them read. robot: the one that does.
+    choices: what the memories that will train on them read.
+    robot: the one that does.
     """
     groups = []
     counts = counts_of(nano.task, nano.demonstrations, nano.demonstrations_of)
@@ -311,7 +312,8 @@ def record_all(
 class Group:
     """Scenes of one task and difficulty, of which so many are to be demonstrated.
 
-    scene: the next one to try; seeds follow each other. files: of those that are demonstrated.
+    scene: the next one to try; seeds follow each other.
+    files: of those that are demonstrated.
     failed: scenes in a row that no demonstration succeeded in.
     """
 

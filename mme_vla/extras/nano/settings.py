@@ -29,7 +29,8 @@ class LearningSettings:
 class NanoRun:
     """A run as a command line describes it, read once; the keys are explained in the file.
 
-    train, learning: plain, as checkpoints keep them. config: all of it as plain values.
+    train, learning: plain, as checkpoints keep them.
+    config: all of it as plain values.
     """
 
     task: Any

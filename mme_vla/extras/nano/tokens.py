@@ -35,8 +35,9 @@ _SOME_WIDTH = 64  # what a scorer gives does not depend on the width of tokens
 class FrameTokens:
     """What the tower made of a demonstration's frames.
 
-    frames: camera → its rendered frames [n] int64, ascending. tokens: camera → [n, patches, d]
-    float16. scores: key of a frame scorer → the rows it gave for the memory camera.
+    frames: camera → its rendered frames [n] int64, ascending.
+    tokens: camera → [n, patches, d] float16.
+    scores: key of a frame scorer → the rows it gave for the memory camera.
     """
 
     frames: dict[str, np.ndarray]
@@ -107,7 +108,8 @@ def tokenize(
 ) -> FrameTokens:
     """Encode all rendered frames of a demonstration.
 
-    policy: with the tower. memories: those whose scorers rate its frames, beside the policy's own.
+    policy: with the tower.
+    memories: those whose scorers rate its frames, beside the policy's own.
     """
     processor = policy.require_processor()
     frames: dict[str, np.ndarray] = {}
@@ -159,8 +161,9 @@ class TokenStore:
     """The tokens of demonstrations by one tower, a file each, in a folder that is named after the
     tower.
 
-    config: of a policy with the tower, as JSON. folder: of all towers' tokens. memories: sections,
-    as JSON, of those whose scorers rate frames.
+    config: of a policy with the tower, as JSON.
+    folder: of all towers' tokens.
+    memories: sections, as JSON, of those whose scorers rate frames.
     """
 
     config: str

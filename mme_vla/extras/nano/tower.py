@@ -155,7 +155,8 @@ class PlaceTower(nn.Module):
     pressed, marked or highlighted. Each is times `FACTORS`.
 
     Args:
-        widths: channels of the three stages. blocks: residual blocks of each.
+        widths: channels of the three stages.
+        blocks: residual blocks of each.
     """
 
     def __init__(self, widths: Sequence[int], blocks: Sequence[int]) -> None:
@@ -203,8 +204,8 @@ def summarise(presence: Tensor, offsets: Tensor) -> Tensor:
     """Tokens [n, t², 20·K] of cells, as `PlaceTower` describes them.
 
     Args:
-        presence: [n, K, 4t, 4t], 0 … 1. offsets: column and row from each cell's centre, in cells,
-            [n, K, 2, 4t, 4t].
+        presence: [n, K, 4t, 4t], 0 … 1.
+        offsets: column and row from each cell's centre, in cells, [n, K, 2, 4t, 4t].
     """
     side = presence.shape[-1]
     middles = torch.arange(side, device=presence.device, dtype=presence.dtype) + 0.5
@@ -256,8 +257,8 @@ def reflect(tokens: Tensor, signs: Tensor, exchange: Tensor) -> Tensor:
     numbers of selected classes behind those of the tower are left as they are.
 
     Args:
-        signs: of columns and rows, 1 or −1, [b, 2]. exchange: whether column and row then change
-            places, [b] bool.
+        signs: of columns and rows, 1 or −1, [b, 2].
+        exchange: whether column and row then change places, [b] bool.
     """
     count, ones = 4 * len(CLASSES), [1] * (tokens.ndim - 2)
     presence, share, column, row = tokens[..., :count].chunk(4, -1)

@@ -45,8 +45,9 @@ class ConvTower(nn.Module):
     are: their middle.
 
     Args:
-        widths: channels of the three stages. blocks: residual blocks of each. out: channels that
-            the outputs are read from.
+        widths: channels of the three stages.
+        blocks: residual blocks of each.
+        out: channels that the outputs are read from.
     """
 
     words: Tensor

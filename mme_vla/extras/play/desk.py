@@ -36,7 +36,8 @@ class Desk:
     Everything that touches the simulator runs in one thread, which also made it. The other methods
     return at once.
 
-    run: whose episodes are played. participant: kept with each record.
+    run: whose episodes are played.
+    participant: kept with each record.
 
     Attributes:
         phase: `loading` (an episode is being set up), `choosing`, `moving`, `ended` (of one
@@ -68,11 +69,11 @@ class Desk:
         """Carry a choice out.
 
         request: `choice` and `point`, with `session` and `decision` (how many were made before), so
-        that a choice sent twice, or from a page left open, does nothing.
+            that a choice sent twice, or from a page left open, does nothing.
 
         Raises:
-            StaleError: the question is no longer asked. UserError: the choice cannot be made;
-                nothing has happened.
+            StaleError: the question is no longer asked.
+            UserError: the choice cannot be made; nothing has happened.
         """
         session = self.session
         requested = (request.get("session"), request.get("decision"))

@@ -31,8 +31,9 @@ MAX_CHOICES = 60  # the longest episode of the benchmark needs fewer than 30
 class Reveal:
     """Frames that are shown together.
 
-    title: what they show. frames: [256, 256, 3] uint8 each, maybe none. start: place of the first
-    in the episode.
+    title: what they show.
+    frames: [256, 256, 3] uint8 each, maybe none.
+    start: place of the first in the episode.
     """
 
     title: str
@@ -44,9 +45,13 @@ class Reveal:
 class Decision:
     """One choice and what came of it.
 
-    choice: letter. action: its text. point: pixel [y, x] of the front image, None where it needs
-    none. frames: [first, stop) of what it revealed, in frames of the episode. status: after it.
-    seconds: from the arrival of the frames to the choice. note: the player's addition.
+    choice: letter.
+    action: its text.
+    point: pixel [y, x] of the front image, None where it needs none.
+    frames: [first, stop) of what it revealed, in frames of the episode.
+    status: after it.
+    seconds: from the arrival of the frames to the choice.
+    note: the player's addition.
     """
 
     choice: str
@@ -132,7 +137,8 @@ class ChoiceSession:
         """Carry out an option.
 
         action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs
-        one. note: what to keep with the decision.
+            one.
+        note: what to keep with the decision.
 
         Returns:
             The frames of the motion; none where nothing moved, or the environment could not do it.

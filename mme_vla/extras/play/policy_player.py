@@ -31,7 +31,8 @@ class PolicyPlayer(Player):
     """Plays what a policy chooses, from the same observations and noise as in an evaluation.
 
     Args:
-        policy: in eval mode, of a robot that chooses among options. model: name of its records.
+        policy: in eval mode, of a robot that chooses among options.
+        model: name of its records.
         seed: of its noise.
     """
 

@@ -25,9 +25,11 @@ def make_session(
 ) -> ChoiceSession:
     """The simulator for one episode.
 
-    episode: which one. env: name of the environment. limit_of: the steps of a task after which it
-    has timed out. max_choices: the choices; None: any number. images: whether the player reads
-    them.
+    episode: which one.
+    env: name of the environment.
+    limit_of: the steps of a task after which it has timed out.
+    max_choices: the choices; None: any number.
+    images: whether the player reads them.
     """
     from mme_vla.envs.base import CHOICES, open_episode
 
@@ -66,7 +68,8 @@ class PlayRun:
 
     Args:
         folder: of `episodes.jsonl` and `run.json`.
-        episodes: to play, in order. identity: of the records.
+        episodes: to play, in order.
+        identity: of the records.
         make: makes the session of an episode.
         retry_errors: play episodes again that ended in an error.
     """
@@ -115,8 +118,10 @@ class PlayRun:
     ) -> EpisodeRecord:
         """Write that an episode could not be played to its end.
 
-        which: the episode. reason: what broke. session: as far as it came; None where it could not
-        even be made. extra: more to keep with the record.
+        which: the episode.
+        reason: what broke.
+        session: as far as it came; None where it could not even be made.
+        extra: more to keep with the record.
         """
         if session is not None:
             if not session.over:

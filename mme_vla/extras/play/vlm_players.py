@@ -59,9 +59,9 @@ def full_question(
 ) -> str:
     """One question that tells the whole episode, `<video>` and `<image>` where images go.
 
-    goal: the task in words. clips: what each clip that was shown is, in order, and whether it has
-    frames. complaint: why the last reply to the same question could not be used; empty the first
-    time.
+    goal: the task in words.
+    clips: what each clip that was shown is, in order, and whether it has frames.
+    complaint: why the last reply to the same question could not be used; empty the first time.
     """
     lines = [f"The task: {goal}"]
     lines += [f"{title}: {VIDEO if frames else 'nothing moved.'}" for title, frames in clips]
@@ -160,8 +160,8 @@ def _parsed(text: str) -> dict[str, Any]:
 class ModelPlayer(Player):
     """A model that makes each choice, with retries where its reply cannot be used.
 
-    model: its name. tries: replies that may be unusable in a row; then the episode counts as
-    failed.
+    model: its name.
+    tries: replies that may be unusable in a row; then the episode counts as failed.
     """
 
     def __init__(self, model: str, tries: int = 3) -> None:
@@ -217,12 +217,13 @@ class QwenPlayer(ModelPlayer):
     """Reads the whole episode anew at each decision: a clip for each motion, and the present image.
 
     Args:
-        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for
-            none.
-        tries: replies that may be unusable in a row. max_new_tokens: longest reply.
+        model: a repository on the hub, a folder, or `tiny`.
+        adapter: LoRA weights to add; None for none.
+        tries: replies that may be unusable in a row.
+        max_new_tokens: longest reply.
         clip_frames: most frames of a clip that the model reads.
-        device, dtype: where and how it runs. vlm: a model that is loaded already, instead of all
-            these.
+        device, dtype: where and how it runs.
+        vlm: a model that is loaded already, instead of all these.
     """
 
     def __init__(

@@ -43,7 +43,7 @@ def make_app(desk: Desk, local: bool = True) -> Any:
     """The ASGI application; the desk begins when it starts.
 
     local: accept only requests that name this machine as their host, so that no foreign page a
-    browser has open can reach the desk under a name of its own.
+        browser has open can reach the desk under a name of its own.
     """
     require_page()
     from starlette.applications import Starlette

@@ -180,8 +180,9 @@ def lacking(
 ) -> str | None:
     """What an arm needs and lacks, for a message; None where it can be probed.
 
-    recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded. n_goals:
-    how many goals the recorded episodes have.
+    recordings: recorded episodes to take from.
+    boundaries: whether sub-tasks are recorded.
+    n_goals: how many goals the recorded episodes have.
     """
     robot = policy.embodiment
     there = {

@@ -81,8 +81,8 @@ class Loss:
     """What an arm costs. success: share of the scenes that it solves, 0 to 1. loss: the matched
     share minus it.
 
-    low, high: 95 % interval of the loss. lost, gained: scenes that only the matched run solves, or
-    only the arm.
+    low, high: 95 % interval of the loss.
+    lost, gained: scenes that only the matched run solves, or only the arm.
     """
 
     success: float
@@ -128,9 +128,10 @@ class Card:
     """Everything a card shows. noise: share of scenes that end otherwise in an equal run with other
     noise.
 
-    interventions: label → the intervention that did it. suites: the memory-or-clock score of each
-    suite's scenes, where they are of several. writing: score of writing (writing.py). references:
-    success of other runs on the same scenes.
+    interventions: label → the intervention that did it.
+    suites: the memory-or-clock score of each suite's scenes, where they are of several.
+    writing: score of writing (writing.py).
+    references: success of other runs on the same scenes.
     """
 
     model: str
@@ -190,8 +191,10 @@ def measure_card(
 
     Args:
         plan: its jobs are the scenes, its recordings those that recovery is measured on, `lend`
-            those to take contents from. references: name → folder of records, floors and ceilings
-            such as `{"demonstrator": "outputs/…"}`. interventions: label → intervention.
+            those to take contents from.
+        references: name → folder of records, floors and ceilings such as `{"demonstrator":
+            "outputs/…"}`.
+        interventions: label → intervention.
     """
     channel = channel_of(policy)
     in_simulation = options.base is make_env and settings.env == "mme_vla"
@@ -263,8 +266,9 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
     """A card from outcomes in closed loop.
 
     Args:
-        matched: of the run without an intervention. arms: label → outcomes on the same scenes.
-            again: of an equal run with other noise.
+        matched: of the run without an intervention.
+        arms: label → outcomes on the same scenes.
+        again: of an equal run with other noise.
     """
     in_every_arm = set(again).intersection(*arms.values())
     keys = [key for key in matched if key in in_every_arm]
@@ -535,8 +539,11 @@ def card_page(
     """The card as an HTML page.
 
     Args:
-        mark: what its heading begins with. lead: the conclusion. method: how the numbers are made.
-            reasons: what the conclusion follows from. detail: end of the subtitle.
+        mark: what its heading begins with.
+        lead: the conclusion.
+        method: how the numbers are made.
+        reasons: what the conclusion follows from.
+        detail: end of the subtitle.
     """
     meanings = meanings_of(map(card.intervention, card.arms))
     terms = [("matched", UNPROBED.meaning)]

@@ -24,8 +24,8 @@ from mme_vla.types import HistoryTokens
 class Entry:
     """One entry of a memory: a frame's tokens, a row of a bank.
 
-    time: in frames that the policy observed (in chunks, for banks that count those). content: what
-    it holds; only the channel it came from can read it.
+    time: in frames that the policy observed (in chunks, for banks that count those).
+    content: what it holds; only the channel it came from can read it.
     """
 
     time: int
@@ -37,8 +37,8 @@ class Remembered:
     """The entries of one store, in the order they are read; None where an intervention took one
     away.
 
-    now: the current time, on the clock of the entries' times. name: which store, for policies that
-    have several.
+    now: the current time, on the clock of the entries' times.
+    name: which store, for policies that have several.
     """
 
     entries: tuple[Entry | None, ...]
@@ -173,9 +173,9 @@ class Channel:
     """One way to what a policy remembers; this one for a policy without a memory that a probe can
     reach.
 
-    clock: what the times of its entries count; None where they have none. sees_pauses: whether
-    frames at which nothing is decided reach this memory. chooses: whether the memory chooses among
-    frames, so that it can be given fewer.
+    clock: what the times of its entries count; None where they have none.
+    sees_pauses: whether frames at which nothing is decided reach this memory.
+    chooses: whether the memory chooses among frames, so that it can be given fewer.
     """
 
     clock: str | None = None

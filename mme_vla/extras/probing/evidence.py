@@ -28,10 +28,13 @@ if TYPE_CHECKING:
 class EvidenceEpisode:
     """One demonstrated episode.
 
-    length: frames. exec_start: the first execution frame. facts: what frames show. boundaries:
-    frames at which a sub-task begins; of an environment that is not RoboMME, the execution.
-    states: [length, s] float32. images: frame → [H, W, 3] uint8 of the camera that memories see,
-    for frames that were rendered.
+    length: frames.
+    exec_start: the first execution frame.
+    facts: what frames show.
+    boundaries: frames at which a sub-task begins; of an environment that is not RoboMME, the
+        execution.
+    states: [length, s] float32.
+    images: frame → [H, W, 3] uint8 of the camera that memories see, for frames that were rendered.
     """
 
     task: str

@@ -60,7 +60,8 @@ class Feed:
         """The episode's frames [n] as numbers of observed frames, int64 [n]; −1 for one that is
         left out.
 
-        exec_start: the episode's first execution frame. before: frames of the sessions.
+        exec_start: the episode's first execution frame.
+        before: frames of the sessions.
         """
         frames = np.asarray(frames, np.int64)
         counts = self._counts(int(frames.max(initial=0)) + 1, exec_start)

@@ -17,8 +17,8 @@ UNCHANGED = 0.0005
 class Effect:
     """The effect of an arm, or an entry, over some steps.
 
-    change, spread, distance: means, as in `Change`. beyond: share of steps at which the change
-    exceeds the spread.
+    change, spread, distance: means, as in `Change`.
+    beyond: share of steps at which the change exceeds the spread.
     """
 
     moments: int

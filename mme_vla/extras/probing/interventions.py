@@ -44,13 +44,17 @@ def _nothing(name: str) -> Remembered:
 class Moment:
     """What an intervention may know of the current step.
 
-    rng: of this episode, this step and this intervention alone. now: the current frame, as
-    observed. stored: stored frames up to now, ascending. boundaries: frames at which a sub-task
-    began. subgoals: earlier ones, the current one last. donor: the store of a name of another
-    episode that is as far along. donor_subgoal: the subgoal there. weigh: for each slot of a store,
-    by how much the chunk changes without it. exec_start: the first execution frame; of a video that
-    is not over, the frame after it. donor_recording: another recorded episode. donor_goal: the goal
-    of one that has another goal.
+    rng: of this episode, this step and this intervention alone.
+    now: the current frame, as observed.
+    stored: stored frames up to now, ascending.
+    boundaries: frames at which a sub-task began.
+    subgoals: earlier ones, the current one last.
+    donor: the store of a name of another episode that is as far along.
+    donor_subgoal: the subgoal there.
+    weigh: for each slot of a store, by how much the chunk changes without it.
+    exec_start: the first execution frame; of a video that is not over, the frame after it.
+    donor_recording: another recorded episode.
+    donor_goal: the goal of one that has another goal.
     """
 
     rng: np.random.Generator
@@ -88,8 +92,9 @@ class Shuffle(Perturbation):
 class Drop(Perturbation):
     """Some entries are taken away; the others keep slot and time.
 
-    count: how many; None takes all. which: the `oldest`, the `newest`, at `random`, or the most
-    `used`, those whose absence changes the chunk most (an attention that any integration has).
+    count: how many; None takes all.
+    which: the `oldest`, the `newest`, at `random`, or the most `used`, those whose absence changes
+        the chunk most (an attention that any integration has).
     """
 
     count: PositiveInt | None = 1

@@ -20,8 +20,11 @@ LINES = "offline*.jsonl"  # The files of all shards
 class MomentLine:
     """An arm at a step of a recorded episode.
 
-    phase: number of the sub-task, 0 for the first; subgoal: its text. dial: the arm's value of its
-    dial. entries: how many there were. touched: ages of those that the arm changed. change, spread,
+    phase: number of the sub-task, 0 for the first.
+    subgoal: its text.
+    dial: the arm's value of its dial.
+    entries: how many there were.
+    touched: ages of those that the arm changed. change, spread,
     distance: see `Change`.
     """
 
@@ -47,8 +50,10 @@ class MomentLine:
 class EntryLine:
     """How the chunk changes without one entry.
 
-    slot: its index; time: its frame; age: frames since then. video: whether it is from the
-    conditioning video.
+    slot: its index.
+    time: its frame.
+    age: frames since then.
+    video: whether it is from the conditioning video.
     """
 
     recording: str

@@ -31,9 +31,9 @@ class Change:
     """What became of a chunk, in normalised actions (1: half of what the training data span), root
     mean square.
 
-    change: mean distance of two chunks of the same noise. spread: mean distance of two chunks that
-    differ in noise alone, unprobed. distance: energy distance of the two distributions, 0 where
-    they are one.
+    change: mean distance of two chunks of the same noise.
+    spread: mean distance of two chunks that differ in noise alone, unprobed.
+    distance: energy distance of the two distributions, 0 where they are one.
     """
 
     change: float
@@ -72,8 +72,10 @@ def probe_offline(
 ) -> list[Line]:
     """Probe every recorded episode that the file holds no lines of yet; all its lines, old and new.
 
-    recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the
-    lines. after: called after each episode with 1.
+    recordings: episodes to probe.
+    lend: episodes to take from, the same or others.
+    path: of the lines.
+    after: called after each episode with 1.
     """
     donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
     with FolderLock(path.parent, "probe", f".{path.stem}.lock"):

@@ -31,9 +31,10 @@ from mme_vla.types import Noise, stack_noise
 class ProbedEpisode(Episode):
     """Passes frames on to `inner`, the policy's own episode, as an arm's feed shows them.
 
-    exec_start: the first execution frame, once it is observed. boundaries: observed frames at which
-    sub-tasks began, where the environment reports them. recording: the recorded episode, if it is
-    one. subgoals: those that were set at each chunk so far.
+    exec_start: the first execution frame, once it is observed.
+    boundaries: observed frames at which sub-tasks began, where the environment reports them.
+    recording: the recorded episode, if it is one.
+    subgoals: those that were set at each chunk so far.
     """
 
     recording: Recording | None = None
@@ -313,7 +314,8 @@ class ProbedPolicy(Policy):
         """Wrap a policy.
 
         sessions: recorded episodes, of which as many as the arm needs are observed before each
-        episode. donors: to take contents from.
+            episode.
+        donors: to take contents from.
         """
         super().__init__()
         self.inner, self.arm, self.donors = inner, arm, donors
@@ -469,8 +471,9 @@ class ProbedPolicy(Policy):
         """Normalised chunks [variants, draws, h, w] as they are executed, adding nothing to the
         episode's memory.
 
-        variants: what is remembered, store by store. draws: the random numbers that all variants
-        share. batch: most chunks that are chosen at once.
+        variants: what is remembered, store by store.
+        draws: the random numbers that all variants share.
+        batch: most chunks that are chosen at once.
         """
         chunks = []
         pairs = [(variant, sampled) for variant in variants for sampled in draws]

@@ -364,7 +364,9 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording, columns: 
     """The frames remembered at a step, each with its age and how the chunk changes without it; the
     current one last.
 
-    lines: of one step. recording: theirs. columns: frames a row.
+    lines: of one step.
+    recording: theirs.
+    columns: frames a row.
     """
     step, tiles = lines[0].step, []
     for line in sorted(lines, key=lambda line: line.time):
@@ -422,7 +424,8 @@ def write_images(findings: Findings, recordings: Sequence[Recording], folder: Pa
 class Notes:
     """What a reader has to know beside the figures.
 
-    warnings: sentences on what was run. left_out: why some of the default arms are not there.
+    warnings: sentences on what was run.
+    left_out: why some of the default arms are not there.
     """
 
     warnings: Sequence[str] = ()

@@ -60,9 +60,11 @@ OFFLINE = "offline"
 class ProbePlan:
     """What is probed.
 
-    arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
-    jobs: episodes of the closed loop, none for none. events: further arms of the closed loop, in
-    the simulation.
+    arms: as in `with`; None for `DEFAULT_ARMS`.
+    recordings: episodes to probe.
+    lend: to take from.
+    jobs: episodes of the closed loop, none for none.
+    events: further arms of the closed loop, in the simulation.
     """
 
     arms: Any = None
@@ -260,10 +262,10 @@ def probe(
         tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
         seed: of noise and of random choices.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
-        name: what lines and records call the policy. base: makes an environment with the
-            benchmark's interface.
-        show_progress: whether a progress bar is shown. event: further arms of the closed loop, as
-            for `evaluate`.
+        name: what lines and records call the policy.
+        base: makes an environment with the benchmark's interface.
+        show_progress: whether a progress bar is shown.
+        event: further arms of the closed loop, as for `evaluate`.
         settings: of `OfflineSettings`, such as `draws=8` chunks a step, and of `RolloutSettings`,
             such as `workers=2`.
 

@@ -28,9 +28,10 @@ IN_CLOSED_LOOP = (
 class OfflineSettings:
     """Settings of a probe on recorded episodes.
 
-    draws: chunks sampled at each step, of the same noise in every arm. moments: most steps of an
-    episode. scan: whether each entry is left out by itself. flow_steps: of the sampler; None for
-    the policy's own.
+    draws: chunks sampled at each step, of the same noise in every arm.
+    moments: most steps of an episode.
+    scan: whether each entry is left out by itself.
+    flow_steps: of the sampler; None for the policy's own.
     """
 
     seed: NonNegativeInt = 42
@@ -44,8 +45,9 @@ class OfflineSettings:
 class ProbeChoice:
     """What a probe is to do; the keys and their meaning are those of `configs/probe.yaml`.
 
-    arms: of `with`. compare: alone or a list. trust_plugins: whether the checkpoint's plugins are
-    imported, which may register perturbations.
+    arms: of `with`.
+    compare: alone or a list.
+    trust_plugins: whether the checkpoint's plugins are imported, which may register perturbations.
     """
 
     compare: PathText | tuple[PathText, ...] | None

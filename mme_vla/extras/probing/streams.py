@@ -21,13 +21,17 @@ from mme_vla.registry import PERTURBATIONS
 class Shown:
     """Frames as a policy observes them, the current one last.
 
-    views: by camera, [t, H, W, 3] uint8. states: [t, s]. demo: whether a frame is of the
-    conditioning video, bool [t]. numbers: which frame of the episode it is, int64 [t]. actions: [t,
-    w], each the one that led to its frame. led: bool [t], False where none did. motions: [n, w],
-    actions that are motions of any length, in place of these. ends: int64 [n], the number of the
-    last frame that came with each. before: by camera the images right before these, as many as the
-    arm's `lag`, fewer at the beginning. start: the state [s] at the first execution frame, once it
-    was observed.
+    views: by camera, [t, H, W, 3] uint8.
+    states: [t, s].
+    demo: whether a frame is of the conditioning video, bool [t].
+    numbers: which frame of the episode it is, int64 [t].
+    actions: [t, w], each the one that led to its frame.
+    led: bool [t], False where none did.
+    motions: [n, w], actions that are motions of any length, in place of these.
+    ends: int64 [n], the number of the last frame that came with each.
+    before: by camera the images right before these, as many as the arm's `lag`, fewer at the
+        beginning.
+    start: the state [s] at the first execution frame, once it was observed.
     """
 
     views: Mapping[str, np.ndarray]

@@ -69,9 +69,10 @@ class NoPairError(Exception):
 class TwinLine:
     """One pair of twins.
 
-    candidates: how many there are. chance: the share of pairs that a guess solves. arms: name of
-    the arm → its share of the pair, 0 to 1: the product of those of its two scenes. left_out: why
-    there is no pair; empty where there is one.
+    candidates: how many there are.
+    chance: the share of pairs that a guess solves.
+    arms: name of the arm → its share of the pair, 0 to 1: the product of those of its two scenes.
+    left_out: why there is no pair; empty where there is one.
     """
 
     task: str
@@ -86,8 +87,8 @@ class TwinLine:
 class Decision:
     """One scene of a pair at its decision.
 
-    chunks: of each arm the actions [n, w] that are executed next. actions: the demonstrator's,
-    which led here.
+    chunks: of each arm the actions [n, w] that are executed next.
+    actions: the demonstrator's, which led here.
     """
 
     goal: str
@@ -103,7 +104,8 @@ def nearest_candidates(places: np.ndarray, start: np.ndarray, end: np.ndarray) -
     two of them. Of a tool that has reached none it is the one whose distance fell the most.
 
     Args:
-        places: of the candidates [n, d]. start, end: of the tool [d].
+        places: of the candidates [n, d].
+        start, end: of the tool [d].
     """
     before = np.linalg.norm(places - start, axis=1)
     after = np.linalg.norm(places - end, axis=1)
@@ -341,8 +343,8 @@ _RECORDED = {"joint_angle": "joint_action", "ee_pose": "eef_action"}
 class Accuracy:
     """Twin accuracy of one arm over the pairs of one or several tasks.
 
-    accuracy, low, high: share of the pairs, a mean over tasks, with its 95 % interval. chance: what
-    a guess has.
+    accuracy, low, high: share of the pairs, a mean over tasks, with its 95 % interval.
+    chance: what a guess has.
     """
 
     pairs: int
@@ -356,7 +358,9 @@ class Accuracy:
 class Twins:
     """The twin accuracy of a policy.
 
-    tasks, suites: name → arm → accuracy. total: arm → accuracy. notes: what was left out.
+    tasks, suites: name → arm → accuracy.
+    total: arm → accuracy.
+    notes: what was left out.
     """
 
     model: str

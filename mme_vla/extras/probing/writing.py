@@ -45,10 +45,12 @@ class TokensReadError(UserError):
 class EpisodeWriting:
     """What a memory kept along one episode, against the frames that show its facts.
 
-    precision: share of the kept frames that show a fact. recall: share of the facts so far of which
-    a frame is kept. Both are means over the steps of the execution. chance_precision,
-    chance_recall: the expectation for as many frames at random. lags: of each fact that was kept at
-    some step, frames from its first frame to the first such step.
+    precision: share of the kept frames that show a fact.
+    recall: share of the facts so far of which a frame is kept. Both are means over the steps of the
+        execution. chance_precision,
+    chance_recall: the expectation for as many frames at random.
+    lags: of each fact that was kept at some step, frames from its first frame to the first such
+        step.
     """
 
     precision: float
@@ -85,9 +87,11 @@ def score_episode(
     execution.
 
     Args:
-        selection: the frames selected at a step. facts: name → frames that show it, ascending.
-        length: of the episode. exec_start: its first execution frame. stride: frames between two
-            steps.
+        selection: the frames selected at a step.
+        facts: name → frames that show it, ascending.
+        length: of the episode.
+        exec_start: its first execution frame.
+        stride: frames between two steps.
     """
     visible = np.zeros((len(facts), length), bool)
     for row, frames in zip(visible, facts.values(), strict=True):
@@ -126,8 +130,8 @@ class Operations:
 
     stored: of each fact that a decision depends on, whether the memory keeps a frame of it there.
     updated: of each fact that another one replaced before the decision, whether as many frames of
-    the new one are kept there as of the old one, and at least one. n_stored: facts stored at each
-    decision.
+        the new one are kept there as of the old one, and at least one.
+    n_stored: facts stored at each decision.
     """
 
     stored: Sequence[bool]
@@ -139,7 +143,8 @@ def operations_of(selection: Selection, facts: Sequence[Fact]) -> Operations:
     """Storage and update of one episode.
 
     Args:
-        selection: the frames selected at a step. facts: with the decisions that need them.
+        selection: the frames selected at a step.
+        facts: with the decisions that need them.
     """
     stored: list[bool] = []
     updated: list[bool] = []
@@ -173,8 +178,8 @@ def _frames_of(fact: Fact, frames: np.ndarray) -> int:
 class Writing:
     """The scores of one memory: task → its episodes.
 
-    operations: task → those of its episodes. budget: tokens of the memory; None where the frames
-    are no memory's.
+    operations: task → those of its episodes.
+    budget: tokens of the memory; None where the frames are no memory's.
     """
 
     tasks: dict[str, list[EpisodeWriting]] = field(default_factory=dict)
@@ -185,8 +190,8 @@ class Writing:
         """`tasks` and `mean`: rows of `precision`, `recall`, `score`, `chance`, `lag`, `held`,
         `facts`, `episodes`, `storage`, `update` and `compression`.
 
-        lag: mean, in frames; None where no fact was kept. held: share of the facts that were kept
-        at some step.
+        lag: mean, in frames; None where no fact was kept.
+        held: share of the facts that were kept at some step.
         """
         rows = {}
         for task, episodes in self.tasks.items():
@@ -337,8 +342,8 @@ def memory_selection(
     """What a memory keeps along an episode.
 
     Args:
-        states: of the robot, normalised [t, s]. policy: makes the tokens; None where the memory
-            reads none to choose.
+        states: of the robot, normalised [t, s].
+        policy: makes the tokens; None where the memory reads none to choose.
     """
     # The scores of frames, for memories that choose by them.
     scorer = memory.make_scorer()

@@ -19,7 +19,8 @@ from mme_vla.types import Batch, MemoryTokens
 class SamplePath:
     """A chunk with the states it went through.
 
-    states: [b, k + 1, h, a], from noise to the chunk. deviation: of each of the k Gaussian steps.
+    states: [b, k + 1, h, a], from noise to the chunk.
+    deviation: of each of the k Gaussian steps.
     log_prob: [b], log-density of the states; None where `deviation` is 0.
     """
 
@@ -50,8 +51,9 @@ def sample_path(
     Args:
         deviation: σ of each step's noise, in units of normalised actions.
         steps: Euler steps; the head's own number by default.
-        generator: of the noise, on the CPU. noise: the start x_0 [b, h, a]; sampled by default.
-            increments: the steps' noise ε [b, k, h, a]; likewise.
+        generator: of the noise, on the CPU.
+        noise: the start x_0 [b, h, a]; sampled by default.
+        increments: the steps' noise ε [b, k, h, a]; likewise.
         memory: memory tokens; by default those of `batch.history`.
     """
     if deviation < 0:
@@ -79,8 +81,8 @@ def path_log_prob(
     """Log-density [b] of a path under the policy as it is now, with gradient.
 
     Args:
-        batch: what the path was sampled for. memory: memory tokens; by default those of
-            `batch.history`.
+        batch: what the path was sampled for.
+        memory: memory tokens; by default those of `batch.history`.
     """
     if not path.deviation:
         raise UserError("A path without noise has no density: sample it with deviation > 0.")

@@ -48,17 +48,21 @@ ARGUMENTS_INSTEAD = {
 class Trajectory:
     """One episode, decision by decision; t decisions. What `keep` leaves out is None.
 
-    job: which episode. outcome: `success`, `fail`, `timeout` or `error`. steps: control steps.
+    job: which episode.
+    outcome: `success`, `fail`, `timeout` or `error`.
+    steps: control steps.
     error: of an episode that an error ended, its message. Before the first decision t is 0, and
-    there are no rows. chunks: [t, h, a], sampled, in the network's units. actions: float32 [n, w]
-    of each decision, executed. observations: rows of what the policy saw, with the memory's
-    selection; `actions` are the executed ones in the
-        network's units, `action_mask` marks them.
+        there are no rows.
+    chunks: [t, h, a], sampled, in the network's units.
+    actions: float32 [n, w] of each decision, executed.
+    observations: rows of what the policy saw, with the memory's selection; `actions` are the
+        executed ones in the network's units, `action_mask` marks them.
     rewards: [t], of the actions of each decision.
     log_probs: [t], of the executed choices (`log_prob`) or of the sampled path (`path_log_prob`).
     paths: of a flow with `backbone.head.deviation`, the states [t, k + 1, h, a] from noise to
-    chunk. oracle: `observations` of the decisions at which the oracle had an action, with its
-    actions as `actions`.
+        chunk.
+    oracle: `observations` of the decisions at which the oracle had an action, with its actions as
+        `actions`.
     """
 
     job: Job
@@ -274,7 +278,8 @@ class _Decision:
 class _Collector(Rollout):
     """A rollout that keeps every decision, and makes a trajectory of each episode.
 
-    keep, oracle_share: as for `rollouts`. finished: trajectories that were not yielded yet.
+    keep, oracle_share: as for `rollouts`.
+    finished: trajectories that were not yielded yet.
     """
 
     policy: MMEPolicy

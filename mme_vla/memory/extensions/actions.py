@@ -42,9 +42,11 @@ class MotionRows(History):
     """A history whose tokens are rows of numbers, padded with zeros to the width of a token.
 
     Args:
-        source: the episode's history. read: frames [n] → rows [n, w] float32. width: of a token.
-        memory: its name, for the error where a row is too long. device: to which rows are moved;
-            None leaves them where they are.
+        source: the episode's history.
+        read: frames [n] → rows [n, w] float32.
+        width: of a token.
+        memory: its name, for the error where a row is too long.
+        device: to which rows are moved; None leaves them where they are.
     """
 
     def __init__(
@@ -164,9 +166,10 @@ class ActionMemory(RecurrentMemory):
         pooling.
 
         Args:
-            budget: memory tokens. hidden: width of the LSTM; None is a quarter of `d_vision`, at
-                least 64.
-            layers: of the LSTM. max_steps, max_video, stride: which frames it reads.
+            budget: memory tokens.
+            hidden: width of the LSTM; None is a quarter of `d_vision`, at least 64.
+            layers: of the LSTM.
+            max_steps, max_video, stride: which frames it reads.
         """
         check_sizes("memory", budget=budget, layers=layers)
         hidden = default_hidden(d_vision, hidden)

@@ -24,7 +24,8 @@ MLP = 4
 class ReaderOptions:
     """Options of the small transformer by which a memory reads.
 
-    layers: number of blocks. hidden: their width; None is a quarter of `d_vision`, at least 64.
+    layers: number of blocks.
+    hidden: their width; None is a quarter of `d_vision`, at least 64.
     heads: None is one for each 64 of `hidden`, at least 2.
     """
 

@@ -93,7 +93,8 @@ class Retrieval(nn.Module):
         """Build it.
 
         Args:
-            width: d. read: width of an entry, where it is another.
+            width: d.
+            read: width of an entry, where it is another.
             retrieval_layers: blocks the current tokens read the entries through.
             time_code: whether keys carry their moment's time.
             fusion: how current and retrieved tokens become one: `gate` (learned, each number its
@@ -164,8 +165,8 @@ class MemoryBank(Retrieval):
         """Build the layers of a bank.
 
         Args:
-            width, retrieval_layers, time_code, fusion: as for `Retrieval`. length: most moments it
-                holds.
+            width, retrieval_layers, time_code, fusion: as for `Retrieval`.
+            length: most moments it holds.
             consolidation: what becomes of a moment too many: `tome` makes the two most alike
                 neighbours one, `fifo` drops the oldest.
         """
@@ -181,8 +182,9 @@ class MemoryBank(Retrieval):
         """The content of banks that took b sequences of moments one by one, with fixed shapes.
 
         Args:
-            moments: [b, t, n, d]. times: [b, t] int64. valid: [b, t] bool, False on padding, which
-                goes in front.
+            moments: [b, t, n, d].
+            times: [b, t] int64.
+            valid: [b, t] bool, False on padding, which goes in front.
 
         Returns:
             Entries [b, k, n, d] without gradients, times [b, k] and whether there is such an entry
@@ -256,7 +258,8 @@ class Banked(FrameMemory):
         """Put the parts together.
 
         Args:
-            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            d_vision: width of a vision token.
+            width: of a memory token, given by the integration.
             budget: most memory tokens; grid×grid of them are made.
             grid, pooling: a moment is grid×grid tokens.
             stride, every, moments, video: which frames are moments (`recurrent_frames`), the

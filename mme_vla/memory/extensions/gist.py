@@ -68,10 +68,11 @@ class Gist(FrameMemory):
         """Put the parts together.
 
         Args:
-            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            d_vision: width of a vision token.
+            width: of a memory token, given by the integration.
             budget: most memory tokens; what whole frames leave of it holds gists.
-            anchors, recent: whole frames at the beginning and at the end. gists: tokens of each
-                frame between.
+            anchors, recent: whole frames at the beginning and at the end.
+            gists: tokens of each frame between.
             grid, pooling: a frame that is read is grid×grid tokens.
             stride, every: frames between two that are read, and how they are counted
                 (`recurrent_frames`); the first is always read.

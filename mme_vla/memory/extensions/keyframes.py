@@ -56,8 +56,8 @@ class Keyframes(PerceptualMemory, ReadsLabels):
 
         Args:
             grid, pooling: a frame is grid×grid tokens.
-            every: frames 0 and k·every − 1 can be kept. pool: most of them that the head reads,
-                evenly spaced.
+            every: frames 0 and k·every − 1 can be kept.
+            pool: most of them that the head reads, evenly spaced.
             hidden: width of the head; None is a quarter of `d_vision`, at least 64.
         """
         check_sizes("memory", every=every, pool=pool)
@@ -140,7 +140,8 @@ def write_loss(scores: Tensor, subtask: Tensor, valid: Tensor) -> Tensor:
     counting alike.
 
     Args:
-        subtask: the number of each frame's sub-task, [b, t]. valid: bool [b, t].
+        subtask: the number of each frame's sub-task, [b, t].
+        valid: bool [b, t].
     """
     begins = torch.diff(subtask, dim=1, prepend=subtask[:, :1]).ne(0)
     losses = functional.binary_cross_entropy_with_logits(

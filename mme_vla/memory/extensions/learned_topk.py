@@ -63,8 +63,10 @@ class LearnedTopK(MemoryModule):
         """Put the parts together.
 
         Args:
-            d_vision: width of a vision token. width: of a memory token, given by the integration.
-            budget: memory tokens. pool: frames whose tokens compete for them.
+            d_vision: width of a vision token.
+            width: of a memory token, given by the integration.
+            budget: memory tokens.
+            pool: frames whose tokens compete for them.
             every: frames 0 and k·every − 1 can compete; the others are neither rendered nor
                 encoded. 1: all.
             grid, pooling: a frame is grid×grid tokens.
@@ -160,7 +162,8 @@ class LearnedTopK(MemoryModule):
         """Choose the candidates that are kept.
 
         Args:
-            scores: [b, n]. mask: [b, n] bool, False on padding.
+            scores: [b, n].
+            mask: [b, n] bool, False on padding.
 
         Returns:
             Their indices [b, budget − 1], ascending, padding last of all; and a soft choice [b, n]

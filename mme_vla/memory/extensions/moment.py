@@ -57,7 +57,8 @@ class Moment(FrameMemory):
         """Put the parts together.
 
         Args:
-            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            d_vision: width of a vision token.
+            width: of a memory token, given by the integration.
             budget: most memory tokens; budget / moments frames are read.
             moments: learned queries that read every frame.
             grid, pooling: a frame that is read is grid×grid tokens.

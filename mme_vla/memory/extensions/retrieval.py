@@ -82,8 +82,8 @@ class Retrieval(PerceptualMemory):
         """Which frames are remembered.
 
         Args:
-            features: of the stored frames, [n, d], of length 1. execution: bool [n], False in the
-                video.
+            features: of the stored frames, [n, d], of length 1.
+            execution: bool [n], False in the video.
 
         Returns:
             int64 [`frames`], ascending, the newest last.

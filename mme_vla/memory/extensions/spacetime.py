@@ -55,11 +55,13 @@ class SpaceTime(MemoryModule):
         """Configure the frames, and what is read of them.
 
         Args:
-            d_vision: width of a vision token, to which a state is padded on its way. width: of a
-                memory token.
-            frames: how many, the current one among them. stride: frames between two.
+            d_vision: width of a vision token, to which a state is padded on its way.
+            width: of a memory token.
+            frames: how many, the current one among them.
+            stride: frames between two.
             every: interval of the tower's layers that attend over time, at least the last one.
-            views: give the tower past images. states: hand over past states as tokens.
+            views: give the tower past images.
+            states: hand over past states as tokens.
             state_dim: numbers a state is padded to before its layer.
             budget: maximum number of memory tokens, at least `frames`; None for `frames`.
         """

@@ -45,8 +45,8 @@ def open_patiently[T](connect: Callable[[], T], seconds: float) -> T:
     """Open a connection; a server that is not there, or is full, is tried for so many seconds.
 
     Raises:
-        UserError: there is none by then, or the server refuses the connection. TimeoutError: the
-            server says nothing.
+        UserError: there is none by then, or the server refuses the connection.
+        TimeoutError: the server says nothing.
     """
     until = time.monotonic() + seconds
     while True:
@@ -65,9 +65,10 @@ class HttpConnection:
     """The challenge's HTTP: `/metadata`, `/reset` and `/infer`, in one session.
 
     Args:
-        url: `http://host:port`, with the path before `/metadata` if there is one. api_key: of the
-            server, if it has one. timeout: seconds to wait for a reply, all of it. open_timeout:
-            for the connection.
+        url: `http://host:port`, with the path before `/metadata` if there is one.
+        api_key: of the server, if it has one.
+        timeout: seconds to wait for a reply, all of it.
+        open_timeout: for the connection.
     """
 
     def __init__(
@@ -168,8 +169,10 @@ class HarnessConnection:
     """The protocol of vla-evaluation-harness 0.8: typed messages with a number, the client's first.
 
     Args:
-        url: `ws://host:port`. api_key: of the server, if it has one. timeout: seconds to wait for a
-            reply. open_timeout: for the connection and the first reply.
+        url: `ws://host:port`.
+        api_key: of the server, if it has one.
+        timeout: seconds to wait for a reply.
+        open_timeout: for the connection and the first reply.
     """
 
     VERSION = 1  # of its protocol

@@ -219,7 +219,8 @@ class RemotePolicy(Policy):
         """Connect once, to learn what the server is.
 
         Args:
-            choice: the server. robot: of the command, for servers that do not describe theirs.
+            choice: the server.
+            robot: of the command, for servers that do not describe theirs.
             execute: actions of a chunk that the rollout executes; None for the robot's number.
 
         Raises:
@@ -408,7 +409,8 @@ class RemotePolicy(Policy):
         """The chunk [h, w] float32 of a reply, checked.
 
         Raises:
-            _RefusedError: it is malformed. UserError: `execute` does not fit the server's chunks.
+            _RefusedError: it is malformed.
+            UserError: `execute` does not fit the server's chunks.
         """
         width = self.embodiment.action.width
         actions = reply.get("actions")

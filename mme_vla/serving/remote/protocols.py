@@ -38,12 +38,16 @@ class NewFrames:
     """What an episode observed since its last chunk, the current frame last; no frame after a
     choice that moved nothing.
 
-    goal: the task in words. subgoal: its current part, if a predictor gives one. options: what can
-    be chosen. views: by camera or reading, arrays or lists of t. states: [t, s] float32. current,
+    goal: the task in words.
+    subgoal: its current part, if a predictor gives one.
+    options: what can be chosen.
+    views: by camera or reading, arrays or lists of t.
+    states: [t, s] float32. current,
     state: the current frame, by camera or reading, and its state, which are there in any case.
-    n_video: how many of the frames are of the conditioning video; these come first. executed:
-    actions [k, w] that led to the last k frames. first: whether the episode begins. seed: of its
-    noise.
+    n_video: how many of the frames are of the conditioning video; these come first.
+    executed: actions [k, w] that led to the last k frames.
+    first: whether the episode begins.
+    seed: of its noise.
     """
 
     goal: str
@@ -63,9 +67,10 @@ class ServerProtocol:
     """One way to talk to a server.
 
     shares_memory: whether its servers may have one memory for all connections, so that one episode
-    runs at a time. stateless: whether a request that got no reply may be sent again on another
-    connection. executes_all: whether the protocol has every action of a chunk executed. listens:
-    whether the policy reads more than the current frame, as far as the protocol can tell.
+        runs at a time.
+    stateless: whether a request that got no reply may be sent again on another connection.
+    executes_all: whether the protocol has every action of a chunk executed.
+    listens: whether the policy reads more than the current frame, as far as the protocol can tell.
     """
 
     name: ClassVar[str]

@@ -27,8 +27,10 @@ FRAME_STEP, WINDOW = 2, 8  # MemER: every second frame, eight a row
 class Labels:
     """A demonstration without its images.
 
-    task, number: its name and number; goal: in words, lower-case.
-    exec_start: first execution frame. simple, grounded: [t] the planner's subgoals, lower-case.
+    task, number: its name and number.
+    goal: in words, lower-case.
+    exec_start: first execution frame.
+    simple, grounded: [t] the planner's subgoals, lower-case.
     joints, targets: [t, 7] joint angles and the joint targets of the action of the same step.
     """
 
@@ -156,7 +158,8 @@ def resting_frames(labels: Labels) -> list[int]:
 class Window:
     """One row of MemER.
 
-    past: keyframes before it. frames: those since the row before.
+    past: keyframes before it.
+    frames: those since the row before.
     positions: of the keyframes in `frames`, from 1.
     """
 

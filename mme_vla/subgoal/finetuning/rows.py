@@ -46,11 +46,13 @@ class RowOptions:
     """How rows are made.
 
     noise: lowest and highest integer added to every coordinate, sampled for each row; None adds
-    none. repeat_changes: repeat rows at changes of subgoal (as the released code does for figures).
+        none.
+    repeat_changes: repeat rows at changes of subgoal (as the released code does for figures).
     short_segments: a row for segments shorter than the stride too (not as released).
     second_keyframe: find a second keyframe in one window (as released it is missed, and all that
-    follow with it). substring_match: give ButtonUnmask the extra keyframes of ButtonUnmaskSwap, as
-    released. seed: of the noise.
+        follow with it).
+    substring_match: give ButtonUnmask the extra keyframes of ButtonUnmaskSwap, as released.
+    seed: of the noise.
     """
 
     noise: tuple[int, int] | None = (-2, 1)
@@ -71,7 +73,8 @@ class RowOptions:
 class EpisodeRows:
     """The rows of one episode in one set.
 
-    images: frame numbers by the file names of the rows. video: its file name; None without one.
+    images: frame numbers by the file names of the rows.
+    video: its file name; None without one.
     """
 
     rows: list[Row]

@@ -294,7 +294,8 @@ def make_api(
 
     Args:
         provider: a key of `PROVIDERS`, whose defaults hold for what `settings` does not name.
-        settings: keys of `Settings`. where: the section they stand in, for messages.
+        settings: keys of `Settings`.
+        where: the section they stand in, for messages.
     """
     check_choice(f"{where}.api", provider, PROVIDERS)
     values = {**asdict(PROVIDERS[provider]), **settings}

@@ -29,7 +29,8 @@ class Question:
     """One question.
 
     system, user: texts; `<image>` and `<video>` in the user's mark where images go.
-    images: [H, W, 3] uint8 each. videos: sampled frames of each.
+    images: [H, W, 3] uint8 each.
+    videos: sampled frames of each.
     target: the answer to learn in training; None for a question to the model.
     """
 
@@ -71,7 +72,8 @@ class Completion:
 class VLM:
     """A Qwen3-VL model and its processor.
 
-    model, processor: of transformers. batch_size: questions answered at once.
+    model, processor: of transformers.
+    batch_size: questions answered at once.
     """
 
     def __init__(self, model: Any, processor: Any, batch_size: int = 8) -> None:

@@ -75,7 +75,8 @@ def compare(
     """Which of the goals of episodes were recorded, by task.
 
     Args:
-        recorded: goals by task. requested: episodes with their goals.
+        recorded: goals by task.
+        requested: episodes with their goals.
     """
     coverage: dict[str, TaskCoverage] = {}
     known_goals: dict[str, set[str]] = {}

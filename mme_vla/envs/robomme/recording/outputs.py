@@ -149,8 +149,9 @@ class Job:
 class RecordingPlan:
     """The results of a recording.
 
-    jobs: its episodes. dataset: folder of the LeRobot dataset, if one is wanted. hdf5: folder of
-    the official files, one a task, if they are.
+    jobs: its episodes.
+    dataset: folder of the LeRobot dataset, if one is wanted.
+    hdf5: folder of the official files, one a task, if they are.
     """
 
     jobs: Sequence[Job]

@@ -253,7 +253,8 @@ def arc(
     """Points of a quadratic Bezier curve between two places at the stick's height.
 
     Args:
-        start: [2] or [3]. end: likewise, metres.
+        start: [2] or [3].
+        end: likewise, metres.
         direction: the side on which the curve leaves the chord; clockwise: to the left of the way.
 
     Returns:

@@ -243,7 +243,8 @@ def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.
     RRT* finds.
 
     Args:
-        start, goal: joint angles [7]. seed: of the samples.
+        start, goal: joint angles [7].
+        seed: of the samples.
 
     Returns:
         The path, or None after `ROUNDS` iterations.

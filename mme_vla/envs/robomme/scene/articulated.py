@@ -67,7 +67,8 @@ class Peg(Thing):
     that along x.
 
     Args:
-        length: of each half, metres. radius: half the thickness, metres.
+        length: of each half, metres.
+        radius: half the thickness, metres.
     """
 
     def __init__(self, name: str, articulation: Any, length: float, radius: float) -> None:
@@ -135,8 +136,11 @@ def build_peg(
     """A peg on the table.
 
     Args:
-        length: of each half, metres. radius: half the thickness, metres.
-        xy: middle of the head half. yaw: radians. z: height of the middle.
+        length: of each half, metres.
+        radius: half the thickness, metres.
+        xy: middle of the head half.
+        yaw: radians.
+        z: height of the middle.
     """
     half, touched = [length / 2, radius, radius], [0.9 * length / 2, radius, radius]
     builder = env.scene.create_articulation_builder()

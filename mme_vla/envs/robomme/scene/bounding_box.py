@@ -32,7 +32,8 @@ def shadow_of_smallest_box(
     Cached, since an object is an obstacle for all that are placed after it.
 
     Args:
-        vertices: [n, 3], float64 in bytes, metres. faces: [m, 3], int64 in bytes.
+        vertices: [n, 3], float64 in bytes, metres.
+        faces: [m, 3], int64 in bytes.
 
     Returns:
         Centre [2], the two axes [2, 2], one a row, of length one or, where upright, zero, and half

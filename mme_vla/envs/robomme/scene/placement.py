@@ -104,8 +104,9 @@ class Region:
 class Box2D:
     """A rectangle on the table in any direction; an axis of length zero makes it a line.
 
-    centre: [2]. axes: [2, 2], one direction a row. half: half its width along each axis [2];
-    metres.
+    centre: [2].
+    axes: [2, 2], one direction a row.
+    half: half its width along each axis [2]; metres.
     """
 
     centre: np.ndarray

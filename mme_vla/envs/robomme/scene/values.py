@@ -223,7 +223,9 @@ class Values:
 
         Args:
             name: path of its place.
-            xy: centre [2]. half: half its side. yaw: radians.
+            xy: centre [2].
+            half: half its side.
+            yaw: radians.
         """
         if not self.specified:
             return

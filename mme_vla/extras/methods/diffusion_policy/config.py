@@ -16,9 +16,10 @@ LARGEST = 2**16
 class DiffusionSizes:
     """The keys of the section `backbone` of Diffusion Policy.
 
-    picture: (height, width) before cropping. widths: of the U-Net's levels. window: frames an
-    observation has. memory_tower, memory_width: what turns remembered frames into tokens, where
-    there is a memory.
+    picture: (height, width) before cropping.
+    widths: of the U-Net's levels.
+    window: frames an observation has.
+    memory_tower, memory_width: what turns remembered frames into tokens, where there is a memory.
     """
 
     horizon: int

@@ -70,9 +70,10 @@ def sample(
     """From noise to chunks.
 
     Args:
-        predict: (noisy chunks [b, h, a], steps [b]) → their noise. start: [b, h, a].
-        fresh: [b, steps − 1, h, a], what is added after each step but the last. steps: fewer than
-            the schedule's.
+        predict: (noisy chunks [b, h, a], steps [b]) → their noise.
+        start: [b, h, a].
+        fresh: [b, steps − 1, h, a], what is added after each step but the last.
+        steps: fewer than the schedule's.
     """
     total = int(schedule.config.num_train_timesteps)
     require(
@@ -217,9 +218,10 @@ class ConditionalUnet1d(nn.Module):
         """Build the network.
 
         Args:
-            condition: c. step_width: of the embedded diffusion step.
-            widths: channels of each level, each with half the steps of the one before. kernel,
-                groups: of all blocks.
+            condition: c.
+            step_width: of the embedded diffusion step.
+            widths: channels of each level, each with half the steps of the one before.
+            kernel, groups: of all blocks.
         """
         super().__init__()
         self.diffusion_step_encoder = nn.Sequential(
@@ -290,8 +292,8 @@ class DiffusionNetwork(nn.Module):
         """Build it.
 
         Args:
-            memory_feature: numbers that a memory adds to the condition. tower: whether frames are
-                to be remembered.
+            memory_feature: numbers that a memory adds to the condition.
+            tower: whether frames are to be remembered.
         """
         super().__init__()
         self.sizes = sizes
@@ -330,8 +332,9 @@ class DiffusionNetwork(nn.Module):
         memory's feature.
 
         Args:
-            images: [b, t, v, 3, h, w] in [−1, 1], cropped. state: [b, t, s] normalised. text: [b,
-                d] of unit length.
+            images: [b, t, v, 3, h, w] in [−1, 1], cropped.
+            state: [b, t, s] normalised.
+            text: [b, d] of unit length.
         """
         flat = images.flatten(0, 2)
         features = run_layer(self.image_encoder, flat, how=self.training and self.recomputed)

@@ -149,7 +149,8 @@ class DiffusionPolicy(NetworkPolicy):
         """The mean squared error of the predicted noise, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. noise: as `training_noise` makes them.
+            batch: with `actions`.
+            noise: as `training_noise` makes them.
             corner: (top, left) of the crop; by default sampled while training and the centre's
                 else.
         """
@@ -236,8 +237,8 @@ class DiffusionPolicy(NetworkPolicy):
         """A normalised chunk [b, h, a], from the first step of the current frame on.
 
         Args:
-            noise: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as
-                trained by default.
+            noise: as `sampling_noise` makes them, with a batch axis.
+            steps: of the sampler; 100 as trained by default.
             memory: memory tokens encoded beforehand.
         """
         if noise is None:

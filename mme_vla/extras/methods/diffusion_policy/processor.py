@@ -81,9 +81,12 @@ BY = "extremes"
 class DiffusionBatch(TensorStruct):
     """Inputs of Diffusion Policy, and for training its targets.
 
-    images: [b, t, v, 3, H, W] uint8; the window's images, the current ones last. state: [b, t, s]
-    normalised. text: [b, d] the goal's vector. actions: [b, h, a] normalised. action_mask: [b, h]
-    bool; None counts all steps. history: the memory's selection, None for a policy without memory.
+    images: [b, t, v, 3, H, W] uint8; the window's images, the current ones last.
+    state: [b, t, s] normalised.
+    text: [b, d] the goal's vector.
+    actions: [b, h, a] normalised.
+    action_mask: [b, h] bool; None counts all steps.
+    history: the memory's selection, None for a policy without memory.
     """
 
     images: Tensor
@@ -119,9 +122,10 @@ class DiffusionProcessor(GoalProcessor):
         Args:
             picture: (height, width) of the images before cropping; images of this size are left as
                 they are.
-            text: `clip`, `hashed`, or the folder of a CLIP. text_dim: width of its vectors.
-            window: frames of an observation. frames: `consecutive`, or `asked`: those at which the
-                policy was asked.
+            text: `clip`, `hashed`, or the folder of a CLIP.
+            text_dim: width of its vectors.
+            window: frames of an observation.
+            frames: `consecutive`, or `asked`: those at which the policy was asked.
             memory_size: side of the images that a memory's vision tower reads.
         """
         check_choice("processor.frames", frames, FRAMES)

@@ -93,7 +93,7 @@ class DitConfig:
     """DiT-L by default; S is 384 × 6 layers × 4 heads, B 768 × 12 × 12.
 
     perceptual_init: how the attention to perceptual tokens begins: `zero`, as released (it begins
-    silent), or `xavier`.
+        silent), or `xavier`.
     """
 
     width: int = 1024
@@ -187,7 +187,9 @@ class Dit(nn.Module):
         """What the first block reads [b, h + 1, d].
 
         Args:
-            x: noised chunks [b, h, a]. steps: [b]. cognition: [b, 1, d_cognition].
+            x: noised chunks [b, h, a].
+            steps: [b].
+            cognition: [b, 1, d_cognition].
             drop: [b] bool; whose cognition token gives way.
         """
         if drop is not None:

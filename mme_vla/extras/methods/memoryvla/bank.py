@@ -29,8 +29,9 @@ class MemoryRetrieval(Retrieval):
 class BankState:
     """The content of a bank in one episode, in the order of time, without gradients.
 
-    entries: [t, n, d]. times: [t] int64. merged: where the last update merged two entries; −1
-    where it did not.
+    entries: [t, n, d].
+    times: [t] int64.
+    merged: where the last update merged two entries; −1 where it did not.
     """
 
     entries: Tensor
@@ -107,7 +108,8 @@ class EpisodeBank(MemoryBank):
         """Take sequences of moments side by side, each in its own bank.
 
         Args:
-            tokens: [m, n, d], all moments. times: [m] int64.
+            tokens: [m, n, d], all moments.
+            times: [m] int64.
             sequences: places in them, each sequence in the order of time.
             states: banks the sequences continue with; empty ones by default.
 

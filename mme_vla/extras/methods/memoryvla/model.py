@@ -25,7 +25,8 @@ def read_moments(
     """Cognition token [n, 1, d] and vision features [n, p, c] of moments.
 
     Args:
-        images: [n, 3, s, s] in [−1, 1]. prompt, prompt_mask: [n, l].
+        images: [n, 3, s, s] in [−1, 1].
+        prompt, prompt_mask: [n, l].
     """
     features = vlm.encode_images(images)
     embedded, patches = vlm.embed(prompt), vlm.projector(features)
@@ -91,8 +92,9 @@ class MemoryVlaConfig:
     """Sizes of MemoryVLA, and how its head is trained and asked.
 
     perceptual_width, compression_width: of a perceptual token, and of the bottleneck's middle.
-    repeats: copies of a chunk in training, each with its own noise. dropout: how often the
-    cognition token gives way. ddim_steps, guidance: of sampling.
+    repeats: copies of a chunk in training, each with its own noise.
+    dropout: how often the cognition token gives way.
+    ddim_steps, guidance: of sampling.
     """
 
     vision: FusedVisionConfig = field(default_factory=FusedVisionConfig)
@@ -164,9 +166,11 @@ class Core(nn.Module):
         past.
 
         Args:
-            cognition: [m, 1, d]. features: [m, p, c].
-            times: [m]. sequences: places of the moments that share a bank, in the order of time.
-                Banks read these.
+            cognition: [m, 1, d].
+            features: [m, p, c].
+            times: [m].
+            sequences: places of the moments that share a bank, in the order of time. Banks read
+                these.
             memory: tokens [m, n, e] of each moment's own past, if they replace the banks.
         """
         raise NotImplementedError
@@ -304,7 +308,8 @@ def cognition_token(hidden: Tensor, patches: int, words: Tensor) -> Tensor:
     """The state that means the moment: of the last word, behind the images' tokens.
 
     Args:
-        hidden: [m, n, d] of `<s>`, patches, words. words: [m] how many there are, `<s>` among them.
+        hidden: [m, n, d] of `<s>`, patches, words.
+        words: [m] how many there are, `<s>` among them.
 
     Returns:
         [m, 1, d].

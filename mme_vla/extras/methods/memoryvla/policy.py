@@ -208,8 +208,8 @@ class MemoryVlaPolicy(NetworkPolicy):
         """The mean squared error of the predicted noise over all moments, copies and numbers.
 
         Args:
-            batch: with `actions`. noise: of `training_noise` and `augmentation_params`; fresh ones
-                by default.
+            batch: with `actions`.
+            noise: of `training_noise` and `augmentation_params`; fresh ones by default.
         """
         if batch.actions is None:
             raise ValueError(

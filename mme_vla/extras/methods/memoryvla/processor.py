@@ -25,12 +25,15 @@ from mme_vla.types import HistoryTokens, TensorStruct
 class GroupBatch(TensorStruct):
     """Groups of moments, each of one episode in the order of time, padded behind.
 
-    images: [g, m, 3, s, s] uint8. prompt: [g, m, l] ids; prompt_mask: [g, m, l] bool. times: [g, m]
-    int64. valid: [g, m] bool; False on padding. actions: [g, m, h, a] normalised; None when
-    sampling. action_mask: [g, m, h] bool; None counts all actions.
+    images: [g, m, 3, s, s] uint8.
+    prompt: [g, m, l] ids.
+    prompt_mask: [g, m, l] bool.
+    times: [g, m] int64.
+    valid: [g, m] bool; False on padding.
+    actions: [g, m, h, a] normalised; None when sampling.
+    action_mask: [g, m, h] bool; None counts all actions.
     history: a memory's selections [g, m, n, …] of all moments, or [g, n, …] of each group's last
-    one alone; None where
-        banks remember.
+        one alone; None where banks remember.
     """
 
     images: Tensor

@@ -65,7 +65,7 @@ class LlamaConfig:
     """A Llama without grouped keys.
 
     norm_eps: OpenVLA's published configuration leaves it at the class's default of 1e-6, although
-    Llama 2 itself has 1e-5; OpenVLA-OFT trained and tests with that.
+        Llama 2 itself has 1e-5; OpenVLA-OFT trained and tests with that.
     """
 
     width: int = 4096
@@ -83,8 +83,8 @@ class LlamaConfig:
 class OpenVlaConfig:
     """OpenVLA-OFT: the VLM, a token of the state, and a head that reads a chunk off zeroed slots.
 
-    state_dim: numbers of the state that the network reads; 0 for none. end_id: the token that
-    closes the sequence.
+    state_dim: numbers of the state that the network reads; 0 for none.
+    end_id: the token that closes the sequence.
     """
 
     everything_sees_everything: ClassVar[bool] = True

@@ -27,8 +27,9 @@ EPSILON = 1e-8
 class ClippedQuantiles:
     """Maps [q01, q99] to [−1, 1] and clips; a number that never moved becomes 0.
 
-    low, high: the quantiles [d]. scaled: [d] bool; the others pass as they are. still: [d] bool;
-    never moved.
+    low, high: the quantiles [d].
+    scaled: [d] bool; the others pass as they are.
+    still: [d] bool; never moved.
     """
 
     low: np.ndarray
@@ -132,7 +133,8 @@ def crop(pixels: Tensor, top: Tensor, left: Tensor) -> Tensor:
     antialiasing.
 
     Args:
-        pixels: [n, 3, s, s]. top, left: [n] fractions of the image, in [0, 1 − √0.9].
+        pixels: [n, 3, s, s].
+        top, left: [n] fractions of the image, in [0, 1 − √0.9].
 
     Returns:
         [n, 3, s, s].
@@ -202,7 +204,8 @@ def augment(images: Tensor, draws: Tensor) -> Tensor:
     """Crop and change the colours of images, each by its own draws.
 
     Args:
-        images: [n, 3, s, s] uint8. draws: [n, 6] as `draw_changes` makes them.
+        images: [n, 3, s, s] uint8.
+        draws: [n, 6] as `draw_changes` makes them.
 
     Returns:
         [n, 3, s, s] uint8.

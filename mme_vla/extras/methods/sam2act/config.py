@@ -17,10 +17,12 @@ Size = Annotated[int, Range(1, 2**16)]
 class EncoderSizes:
     """SAM2's image encoder (Hiera and its neck); Hiera-B+ by default.
 
-    width, heads: of the first stage; both double from stage to stage. blocks, windows: number of
-    blocks and side of the attention windows, of each stage. global_blocks: blocks, counted through
-    all stages, that attend to the whole image. background: side of the table of positions. neck:
-    width of its output maps. lora: rank of the adapters.
+    width, heads: of the first stage; both double from stage to stage.
+    blocks, windows: number of blocks and side of the attention windows, of each stage.
+    global_blocks: blocks, counted through all stages, that attend to the whole image.
+    background: side of the table of positions.
+    neck: width of its output maps.
+    lora: rank of the adapters.
     """
 
     width: Size = 112
@@ -55,12 +57,18 @@ class SAM2ActSizes:
     """The network: both looks have the same sizes.
 
     grid, patch: patches of a virtual image, and their side in pixels; an image has grid · patch of
-    them. width, heads, depth: of the multi-view transformer. language, words: width and number of
-    the goal's tokens. sam, pictures, state: what of a token's width the encoder's map, the image
-    and the robot's state take. state_dim: numbers of the robot's state. rotation_bins: of a whole
-    turn. head: first width of the heads. memory: width of a remembered place; memory_layers,
-    memory_feedforward: of the attention over memories. mask_stages: halvings between a heatmap's
-    image and the grid. remembered: most keyframes that are read.
+        them.
+    width, heads, depth: of the multi-view transformer.
+    language, words: width and number of the goal's tokens.
+    sam, pictures, state: what of a token's width the encoder's map, the image and the robot's state
+        take.
+    state_dim: numbers of the robot's state.
+    rotation_bins: of a whole turn.
+    head: first width of the heads.
+    memory: width of a remembered place; memory_layers,
+    memory_feedforward: of the attention over memories.
+    mask_stages: halvings between a heatmap's image and the grid.
+    remembered: most keyframes that are read.
     """
 
     encoder: EncoderSizes = field(default_factory=EncoderSizes)

@@ -33,7 +33,9 @@ from mme_vla.policy.episode import Episode, Host
 class SceneInputs:
     """What an episode shows the network at one keyframe.
 
-    points: [n, 3], metres. colours: [n, 3] in [0, 1]. state: [p]: gripper open, two fingers, time.
+    points: [n, 3], metres.
+    colours: [n, 3] in [0, 1].
+    state: [p]: gripper open, two fingers, time.
     language: [l, w].
     """
 

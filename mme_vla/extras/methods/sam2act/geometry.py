@@ -19,8 +19,9 @@ def unproject(depth: np.ndarray, intrinsic: np.ndarray, extrinsic: np.ndarray) -
     A pixel stands at its whole-numbered column and row, not at its centre, as in the released code.
 
     Args:
-        depth: [h, w], metres along the camera's axis. intrinsic: [3, 3]. extrinsic: world to
-            camera, [3, 4] or [4, 4].
+        depth: [h, w], metres along the camera's axis.
+        intrinsic: [3, 3].
+        extrinsic: world to camera, [3, 4] or [4, 4].
     """
     depth, intrinsic, extrinsic = (np.asarray(x, np.float64) for x in (depth, intrinsic, extrinsic))
     rows, columns = np.indices(depth.shape, dtype=np.float64)
@@ -76,7 +77,9 @@ def shift_and_rotate(points: Tensor, centre: Tensor, shift: Tensor, angle: Tenso
     """Points [b, n, 3] turned about the vertical through a centre and moved.
 
     Args:
-        centre: [b, 3]. shift: [b, 3]. angle: [b], radians, counter-clockwise seen from above.
+        centre: [b, 3].
+        shift: [b, 3].
+        angle: [b], radians, counter-clockwise seen from above.
     """
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]
     x, y, z = (points - centre[:, None]).unbind(-1)
@@ -199,7 +202,8 @@ def heatmap_loss(logits: Tensor, points: Tensor, sigma: float = SIGMA) -> Tensor
     """The loss of each sample and view [b, v].
 
     Args:
-        logits: [b, v, 1, side, side]. points: [b, 3], in the cube's coordinates.
+        logits: [b, v, 1, side, side].
+        points: [b, 3], in the cube's coordinates.
     """
     side = logits.shape[-1]
     pixels = project(points, side)
@@ -290,7 +294,8 @@ def z_buffer(points: Tensor, features: Tensor, side: int) -> tuple[Tensor, Tenso
     """Each view's nearest points.
 
     Args:
-        points: [n, 3] in the cube's coordinates. features: [n, c].
+        points: [n, 3] in the cube's coordinates.
+        features: [n, c].
 
     Returns:
         images [3, side, side, c], zero where nothing is, and depths [3, side, side], `EMPTY` there.
@@ -324,7 +329,9 @@ def splat(images: Tensor, depth: Tensor, radius: float = RADIUS) -> tuple[Tensor
     order counts, columns before rows.
 
     Args:
-        images: [v, side, side, c]. depth: [v, side, side]. radius: in the cube's coordinates.
+        images: [v, side, side, c].
+        depth: [v, side, side].
+        radius: in the cube's coordinates.
     """
     side = depth.shape[-1]
     reach = radius * side / 2
@@ -360,7 +367,8 @@ def render(points: Tensor, features: Tensor, side: int, radius: float = RADIUS) 
     """Images [3, side, side, c + 1] of a cloud: its features and, last, the centred depth.
 
     Args:
-        points: [n, 3] in the cube's coordinates. features: [n, c].
+        points: [n, 3] in the cube's coordinates.
+        features: [n, c].
     """
     images, depth = splat(*z_buffer(points, features, side), radius)
     return torch.cat([images, centred(depth)[..., None]], -1)
@@ -374,7 +382,8 @@ def virtual_images(points: Tensor, colours: Tensor, side: int) -> Tensor:
     `constant_channels` (3).
 
     Args:
-        points: [n, 3] in the cube's coordinates; at least one. colours: [n, 3] in [0, 1].
+        points: [n, 3] in the cube's coordinates; at least one.
+        colours: [n, 3] in [0, 1].
     """
     places = points / points.abs().max().clamp(min=1e-12)
     views = render(points, torch.cat([places, colours], -1), side).permute(0, 3, 1, 2)

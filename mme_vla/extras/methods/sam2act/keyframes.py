@@ -100,7 +100,9 @@ class KeyframeFile:
 class Link:
     """One keyframe of a chain.
 
-    frame: what is seen. motion: which is to follow. place: keyframes since the chain was entered.
+    frame: what is seen.
+    motion: which is to follow.
+    place: keyframes since the chain was entered.
     """
 
     frame: int
@@ -203,9 +205,11 @@ class EpisodeKeyframes:
 class KeyframeSample:
     """A run of k keyframes as they are kept, before any processing.
 
-    goal: in words. shots: k times the shots of all cameras. open: [k] whether the gripper's command
-    was to be open. places: [k] keyframes since the chain was entered. targets: [k, 7] the motions
-    that follow.
+    goal: in words.
+    shots: k times the shots of all cameras.
+    open: [k] whether the gripper's command was to be open.
+    places: [k] keyframes since the chain was entered.
+    targets: [k, 7] the motions that follow.
     """
 
     goal: str

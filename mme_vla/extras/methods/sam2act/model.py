@@ -82,8 +82,10 @@ _WIDER = 4  # feed-forward layers, inside
 class EncodedViews:
     """The network's encoding of one view of the scene.
 
-    images: [b, 3, 10, s, s] of `virtual_images`. maps: of the image encoder for all views, finest
-    first: [b·3, token/4, 4g, 4g], [b·3, token/2, 2g, 2g], [b·3, neck, g, g]. state: [b, p].
+    images: [b, 3, 10, s, s] of `virtual_images`.
+    maps: of the image encoder for all views, finest first: [b·3, token/4, 4g, 4g], [b·3, token/2,
+        2g, 2g], [b·3, neck, g, g].
+    state: [b, p].
     language: [b, l, w].
     """
 
@@ -270,7 +272,8 @@ class Heads(nn.Module):
         The bin about y is conditioned on the one about x, the one about z on both.
 
         Args:
-            features: [b, f]. rotation: [b, 3] bins to tell; the most likely ones by default.
+            features: [b, f].
+            rotation: [b, 3] bins to tell; the most likely ones by default.
         """
         gripper, collision = self.gripper(features).chunk(2, -1)
         normed = self.norm(features)

@@ -89,8 +89,8 @@ def augmented(
     """Shift each keyframe's cloud and turn it about its target, and the target's rotation with it.
 
     Args:
-        language: [b, l, w] tokens of the goals. noise: as `augmentation_draws` makes them; None
-            changes nothing.
+        language: [b, l, w] tokens of the goals.
+        noise: as `augmentation_draws` makes them; None changes nothing.
         bins: of a whole turn.
     """
     keyframes = batch.points.shape[1]

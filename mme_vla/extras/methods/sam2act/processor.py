@@ -38,10 +38,13 @@ from mme_vla.types import TensorStruct
 class KeyframeBatch(TensorStruct):
     """Sequences of k keyframes; k is 1 where single transitions are learnt.
 
-    points: [b, k, n, 3], metres in the world, bounds not applied yet. colours: [b, k, n, 3] uint8.
-    state: [b, k, p]. language: [b, l, w] the goal's tokens.
-    target: [b, k, 3], metres. rotation: [b, k, 4], quaternions (x, y, z, w). gripper, collision:
-    [b, k] int64.
+    points: [b, k, n, 3], metres in the world, bounds not applied yet.
+    colours: [b, k, n, 3] uint8.
+    state: [b, k, p].
+    language: [b, l, w] the goal's tokens.
+    target: [b, k, 3], metres.
+    rotation: [b, k, 4], quaternions (x, y, z, w).
+    gripper, collision: [b, k] int64.
     """
 
     points: Tensor
@@ -63,8 +66,10 @@ CHANNELS = 10
 class Shot:
     """One camera at one moment.
 
-    colours: [h, w, 3] uint8. depth: [h, w], millimetres. intrinsic: [3, 3]. extrinsic: world to
-    camera, [3, 4].
+    colours: [h, w, 3] uint8.
+    depth: [h, w], millimetres.
+    intrinsic: [3, 3].
+    extrinsic: world to camera, [3, 4].
     """
 
     colours: np.ndarray
@@ -111,8 +116,8 @@ def cloud_images(points: Tensor, colours: Tensor, cube: Cube, side: int) -> Tens
     """What the coarse look sees of clouds in the world: [b, 3, 10, side, side].
 
     Args:
-        points: [b, n, 3] in metres; those outside of the cube are left out. colours: [b, n, 3] in
-            [0, 1].
+        points: [b, n, 3] in metres; those outside of the cube are left out.
+        colours: [b, n, 3] in [0, 1].
     """
     inside = cube.inside(points)
     return _render_images(cube.place(points), colours, inside, side)
@@ -236,8 +241,8 @@ class SAM2ActProcessor(GoalProcessor):
         """Put it together.
 
         Args:
-            text: `hashed`, or the folder of a CLIP. language, words: width and number of its
-                tokens.
+            text: `hashed`, or the folder of a CLIP.
+            language, words: width and number of its tokens.
             side: pixels that images are brought to before they become points.
             bounds: of the scene in metres, lowest corner first; what is outside is not seen.
             trained_waypoints, waypoints: keyframes that the clock counts to, in training and when

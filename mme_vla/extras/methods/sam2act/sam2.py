@@ -245,8 +245,8 @@ class MemoryAttention(nn.Module):
         """Enriched tokens [b, n, d].
 
         Args:
-            x, positions: [b, n, d]; n is a square's area. memory, places: [b, t·n, m], moment by
-                moment.
+            x, positions: [b, n, d]; n is a square's area.
+            memory, places: [b, t·n, m], moment by moment.
         """
         angles = grid_angles(round(x.shape[1] ** 0.5), x.shape[-1], x.device)
         x = x + _POSITION_SCALE * positions
@@ -309,10 +309,11 @@ class KeyframeBank(nn.Module):
         """Build encoder and attention.
 
         Args:
-            grid: side of a view's grid of tokens. token: their width. memory: width of what is kept
-                of each.
-            layers, feedforward: of the attention. mask_stages: halvings from a heatmap's image to
-                the grid.
+            grid: side of a view's grid of tokens.
+            token: their width.
+            memory: width of what is kept of each.
+            layers, feedforward: of the attention.
+            mask_stages: halvings from a heatmap's image to the grid.
             remembered: most keyframes that are read.
         """
         super().__init__()
@@ -344,7 +345,8 @@ class KeyframeBank(nn.Module):
         """The state after a keyframe.
 
         Args:
-            tokens: [n, d, g, g], as they were before `read`. logits: [n, 1, s, s], its heatmaps.
+            tokens: [n, d, g, g], as they were before `read`.
+            logits: [n, 1, s, s], its heatmaps.
         """
         side = self.grid * 2**self.mask_stages
         mask = nn.functional.interpolate(logits.float(), (side, side), mode="bilinear")

@@ -27,7 +27,8 @@ class HeadSizes:
     """The action head: a transformer over condition tokens, one state token and the chunk.
 
     rope_section: shares of (time, row, column) in the rotary angles, scaled to `rope_factor` of
-    half a head's width. time_alpha: flow times are Beta(time_alpha, 1), 1 = noise.
+        half a head's width.
+    time_alpha: flow times are Beta(time_alpha, 1), 1 = noise.
     """
 
     width: PositiveInt = 2048
@@ -60,8 +61,9 @@ class SimpleMemVlaSizes:
 
     vlm: a `Qwen3_5Config` of transformers, in its own keys (`text_config`, `vision_config`).
     image_size: side of the images, in pixels, that costs are counted at and that a memory's frames
-    are resized to. state_dim: numbers of the state token; 0 for none. memory_width: of a memory's
-    tokens before their projection.
+        are resized to.
+    state_dim: numbers of the state token; 0 for none.
+    memory_width: of a memory's tokens before their projection.
     """
 
     vlm: Mapping[str, Any]

@@ -39,7 +39,9 @@ class VideoHost(Host, Protocol):
 class Ahead:
     """The beginning of the prompt at a later step, as far as it was read.
 
-    step: the frame at which it is used. pairs: its temporal patches. tokens: the prompt.
+    step: the frame at which it is used.
+    pairs: its temporal patches.
+    tokens: the prompt.
     """
 
     step: int
@@ -54,8 +56,9 @@ class Ahead:
 class VideoMemory:
     """What an episode keeps of its video, as far back as a window reaches.
 
-    frames: index → [3, H, W] uint8. patches: the tokens [m, D] of temporal patches. ahead: see
-    `Ahead`.
+    frames: index → [3, H, W] uint8.
+    patches: the tokens [m, D] of temporal patches.
+    ahead: see `Ahead`.
     """
 
     frames: dict[int, Tensor] = field(default_factory=dict)

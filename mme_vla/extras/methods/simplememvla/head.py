@@ -25,8 +25,10 @@ TIME_FREQUENCIES = 128
 class Condition(TensorStruct):
     """What a chunk is sampled under: the words of the sub-task as the language model reads them.
 
-    hidden: [b, S, D] after the final norm. tokens: [b, S, D] input embeddings; None for none.
-    positions: [b, 3, S]. mask: [b, S] bool, False on padding.
+    hidden: [b, S, D] after the final norm.
+    tokens: [b, S, D] input embeddings; None for none.
+    positions: [b, 3, S].
+    mask: [b, S] bool, False on padding.
     """
 
     hidden: Tensor
@@ -169,7 +171,8 @@ class ActionHead(nn.Module):
     """Predicts the velocity of noisy chunks from words, a state and a flow time.
 
     Args:
-        condition_dim: D. state_dim: numbers of the state; 0 for no state token.
+        condition_dim: D.
+        state_dim: numbers of the state; 0 for no state token.
     """
 
     def __init__(
@@ -285,8 +288,8 @@ def channel_loss(velocity: Tensor, target: Tensor, mask: Tensor | None = None) -
     over samples.
 
     Args:
-        velocity, target: [b, h, a]. mask: bool [b, h] or [b, h, a], False on steps that do not
-            count.
+        velocity, target: [b, h, a].
+        mask: bool [b, h] or [b, h, a], False on steps that do not count.
     """
     errors = (velocity.float() - target.float()).square()
     if mask is None:

@@ -171,7 +171,9 @@ class VideoLanguageModel(nn.Module):
         """Hidden states [b, L, D] after the final norm.
 
         Args:
-            embedded: [b, L, D]. positions: [b, 3, L]. cache: of `new_cache`, continued in place.
+            embedded: [b, L, D].
+            positions: [b, 3, L].
+            cache: of `new_cache`, continued in place.
             mask: [b, L of everything so far], False on padding at the left. Padding at the right
                 needs none.
         """
@@ -208,8 +210,9 @@ class VideoLanguageModel(nn.Module):
 
         Args:
             embedded: [b, n, D] of the prompts, padded on the left, without what `prefill` holds.
-            positions: [b, 3, n]. mask: [b, n], False on padding. limit: most words of a response
-                before its end.
+            positions: [b, 3, n].
+            mask: [b, n], False on padding.
+            limit: most words of a response before its end.
             prefill: the beginning of one prompt; its cache is continued.
             words: ids to take instead, without `<|im_end|>`.
 
@@ -269,8 +272,9 @@ def words_loss(
     are the likeliest.
 
     Args:
-        hidden: [b, L, D]. ids: [b, L]. spans: first token of each response, and the one behind its
-            last.
+        hidden: [b, L, D].
+        ids: [b, L].
+        spans: first token of each response, and the one behind its last.
     """
     rows = [(i, place) for i, (start, end) in enumerate(spans) for place in range(start, end)]
     row, place = torch.tensor(rows, device=hidden.device).T
@@ -286,7 +290,9 @@ def response_condition(
     """The hidden states of known responses, padded on the right to the longest.
 
     Args:
-        hidden, embedded: [b, L, D]. positions: [b, 3, L]. spans: as for `words_loss`.
+        hidden, embedded: [b, L, D].
+        positions: [b, 3, L].
+        spans: as for `words_loss`.
     """
     starts, ends = torch.tensor(spans, device=hidden.device).T
     steps = torch.arange(max(end - start for start, end in spans), device=hidden.device)

@@ -108,7 +108,8 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         """Build the network; `processor`, `config` and `options` as for `NetworkPolicy`.
 
         Args:
-            memory: in the video's place. fresh_backbone: initialise the language model's weights.
+            memory: in the video's place.
+            fresh_backbone: initialise the language model's weights.
         """
         super().__init__(processor, config, **options)
         with nullcontext() if fresh_backbone else shapes_only():
@@ -225,8 +226,8 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         """The flow's loss and the cross entropy of the sub-task's words, weighted and added.
 
         Args:
-            batch: with responses and `actions`. noise: of `training_noise` and
-                `augmentation_params`.
+            batch: with responses and `actions`.
+            noise: of `training_noise` and `augmentation_params`.
         """
         if batch.actions is None:
             raise ValueError(

@@ -92,13 +92,21 @@ def processor_settings(config: Mapping[str, Any]) -> PromptSettings:
 class VideoBatch(TensorStruct):
     """Prompts with the images that are in them.
 
-    ids: [b, L] padded on the right. kinds: [b, L] int8 (`prompt.TEXT`, …). positions: [b, 3, L].
-    prompts, lengths: tokens of each row's prompt, and with its response. patches: temporal patches
-    of each row. video: [K, 2, 3, H, W] uint8, the temporal patches of all rows one after the other;
-    None where `features` are given. features: [K, m, D], their tokens. images: [b, c, 3, H, W]
-    uint8, of the cameras without a past. state: [b, s] normalised. actions: [b, h, a] normalised.
-    action_mask: [b, h] bool. history: of a memory. words: ids that each row takes instead of
-    generated ones, up to `<|im_end|>`; None to generate them.
+    ids: [b, L] padded on the right.
+    kinds: [b, L] int8 (`prompt.TEXT`, …).
+    positions: [b, 3, L].
+    prompts, lengths: tokens of each row's prompt, and with its response.
+    patches: temporal patches of each row.
+    video: [K, 2, 3, H, W] uint8, the temporal patches of all rows one after the other; None where
+        `features` are given.
+    features: [K, m, D], their tokens.
+    images: [b, c, 3, H, W] uint8, of the cameras without a past.
+    state: [b, s] normalised.
+    actions: [b, h, a] normalised.
+    action_mask: [b, h] bool.
+    history: of a memory.
+    words: ids that each row takes instead of generated ones, up to `<|im_end|>`; None to generate
+        them.
     """
 
     ids: Tensor
@@ -165,10 +173,10 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """Put the parts together.
 
         Args:
-            factor: pixels of a side that become one token. memory_tokens: of a memory that takes
-                the video's place.
-            image_side: of the images that a memory stores. tokenizer: in place of the one that the
-                settings name.
+            factor: pixels of a side that become one token.
+            memory_tokens: of a memory that takes the video's place.
+            image_side: of the images that a memory stores.
+            tokenizer: in place of the one that the settings name.
         """
         self.settings, self.embodiment = settings, embodiment
         self.factor, self.memory_tokens, self.image_side = factor, memory_tokens, image_side
@@ -284,8 +292,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """A prompt that shows so many temporal patches.
 
         Args:
-            request: of `prompt`. size, image_size: (h, w) of the video's frames and of current
-                images.
+            request: of `prompt`.
+            size, image_size: (h, w) of the video's frames and of current images.
             response: the sub-task that is learned.
         """
         cameras = []

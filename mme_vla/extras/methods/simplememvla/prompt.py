@@ -50,7 +50,8 @@ class WordTokenizer:
     """A tokenizer of the `tokenizers` package with Qwen's special tokens.
 
     Attributes:
-        spec: where it came from, in the words `load` takes. fingerprint: hash of the file.
+        spec: where it came from, in the words `load` takes.
+        fingerprint: hash of the file.
     """
 
     def __init__(self, content: str, spec: str) -> None:
@@ -190,8 +191,8 @@ class CameraTokens:
     """The tokens of one camera in a prompt.
 
     grid: rows and columns of merged tokens of an image or temporal patch.
-    times: of each temporal patch in seconds; None for one image. memory: memory tokens before the
-    first patch.
+    times: of each temporal patch in seconds; None for one image.
+    memory: memory tokens before the first patch.
     """
 
     name: str
@@ -245,10 +246,12 @@ def clean_response(subtask: str) -> str:
 class Tokens:
     """A prompt, and the response where there is one.
 
-    ids: [L] int64. kinds: [L] int8, `TEXT`, `IMAGE`, `VIDEO` or `MEMORY`. positions: [3, L] int64,
-    time, row, column. prompt: tokens before the response. prefix: tokens up to the last one of the
-    temporal patch before the last of the
-        first video; 0 where a prompt does not begin with two patches.
+    ids: [L] int64.
+    kinds: [L] int8, `TEXT`, `IMAGE`, `VIDEO` or `MEMORY`.
+    positions: [3, L] int64, time, row, column.
+    prompt: tokens before the response.
+    prefix: tokens up to the last one of the temporal patch before the last of the first video; 0
+        where a prompt does not begin with two patches.
     """
 
     ids: np.ndarray
@@ -271,8 +274,9 @@ def encode(
     from words.
 
     Args:
-        cameras: in the order in which they are shown. request: of `instruction`. response: of
-            `clean_response`.
+        cameras: in the order in which they are shown.
+        request: of `instruction`.
+        response: of `clean_response`.
     """
     views = "".join(camera.expanded for camera in cameras)
     prompt = tokenizer.encode(

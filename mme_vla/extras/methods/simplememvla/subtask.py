@@ -38,8 +38,9 @@ _COUNTED_WORDS = 12
 class SubtaskBatch(Batch):
     """A batch with the sub-tasks that are learned.
 
-    words: [b, S] ids, the last one ends a text. words_mask: [b, S] bool. forced: ids [b, S] in
-    place of generated ones.
+    words: [b, S] ids, the last one ends a text.
+    words_mask: [b, S] bool.
+    forced: ids [b, S] in place of generated ones.
     """
 
     words: Tensor | None = None
@@ -82,7 +83,9 @@ class SubtaskDecoder(nn.Module):
     """Generates a sub-task word by word, and returns the hidden state of each word.
 
     Args:
-        context_width: of the tokens it reads. width: d. longest: most words.
+        context_width: of the tokens it reads.
+        width: d.
+        longest: most words.
     """
 
     def __init__(
@@ -114,7 +117,8 @@ class SubtaskDecoder(nn.Module):
         """Hidden states [b, S + 1, d]: of the beginning, and at each word [b, S].
 
         Args:
-            context: [b, n, context_width]. mask: [b, n] bool.
+            context: [b, n, context_width].
+            mask: [b, n] bool.
         """
         words = torch.cat([self.begin.expand(len(ids), -1, -1), self.words(ids)], 1)
         words = words + self.places[:, : words.shape[1]]
@@ -162,7 +166,8 @@ class SubtaskPolicy(MMEPolicy):
         """Build the decoder; `parts` and `options` as for `MMEPolicy`.
 
         Args:
-            subtask_depth, subtask_heads: of the decoder. subtask_words: most words of a sub-task.
+            subtask_depth, subtask_heads: of the decoder.
+            subtask_words: most words of a sub-task.
             subtask_weight: of the cross entropy of its words.
         """
         super().__init__(*parts, **options)

@@ -31,9 +31,10 @@ _HUE = np.array([
 class Window:
     """The frames that a video shows at a step.
 
-    seconds, fps: length and rate of the video. native_fps: rate of the camera.
+    seconds, fps: length and rate of the video.
+    native_fps: rate of the camera.
     variable: show only frames that exist, at least two; else a full window, the first frame
-    repeated before the start.
+        repeated before the start.
     """
 
     seconds: float
@@ -85,7 +86,8 @@ def fitting_size(
     within `bounds`.
 
     Args:
-        frames: of a video, all of which count, or 1 for an image. bounds: least and most pixels.
+        frames: of a video, all of which count, or 1 for an image.
+        bounds: least and most pixels.
     """
     if max(height, width) > 200 * min(height, width):
         raise UserError(f"Images of {height}×{width} pixels are too narrow for the vision tower.")

@@ -49,10 +49,11 @@ Number = int | float
 class PublishedConfig:
     """The content of a published config.json, in its own keys.
 
-    backbone_config: Qwen3.5's own configuration. state_dim: of the robot, also where `use_proprio`
-    leaves the state out. image_keys: cameras in the order in which they are shown.
+    backbone_config: Qwen3.5's own configuration.
+    state_dim: of the robot, also where `use_proprio` leaves the state out.
+    image_keys: cameras in the order in which they are shown.
     history_image_keys: those with a video. The text beside a type is the key of a configuration
-    here with the same value.
+        here with the same value.
     """
 
     backbone_config: Mapping[str, Any]

@@ -40,8 +40,8 @@ def main(
 ) -> None:
     """Train where a model is named, read the rows, print and write the board.
 
-    nano: `mme-vla nano`, with the words of `sys.argv`. with_settings: these words with what they
-    imply.
+    nano: `mme-vla nano`, with the words of `sys.argv`.
+    with_settings: these words with what they imply.
     """
     parser = argument_parser("mme-vla nano board", __doc__, EXAMPLES)
     parser.add_argument(

@@ -22,8 +22,9 @@ PARTS = {"memory": "memory", "images": "observation", "prompt": "language", "act
 class AttentionMass:
     """Attention probability mass of the action tokens by layer and part.
 
-    parts: names of the columns. layers: [depth, parts], each row sums to 1: means over action
-    tokens, heads, Euler steps and samples.
+    parts: names of the columns.
+    layers: [depth, parts], each row sums to 1: means over action tokens, heads, Euler steps and
+        samples.
     """
 
     parts: list[str]
