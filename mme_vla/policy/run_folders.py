@@ -75,8 +75,13 @@ folder is a run itself, its `latest` is that run. No folder is called so.
 """
 
 
-def check_output(folder: Path) -> None:
-    """Make sure that a new folder has no name that means another one."""
+def check_output(place: str | Path) -> None:
+    """Make sure that `output` has a name, and none that means another folder."""
+    require(
+        str(place).strip(),
+        "output= is empty: name the place to write to, such as output=outputs/mine.",
+    )
+    folder = Path(place)
     require(
         folder.name != LATEST,
         f"output={folder}: {LATEST!r} is reserved, {folder} means the newest run in"

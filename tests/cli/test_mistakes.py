@@ -134,6 +134,21 @@ def test_the_name_latest_is_reserved(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("command", ["evaluate checkpoint=nano", "train", "convert", "probe"])
+@pytest.mark.parametrize("output", ["output=", "output=''"])
+def test_an_empty_output_is_refused(
+    command: str,
+    output: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    printed = reply([*command.split(), output], monkeypatch, capsys)
+    assert "output= is empty" in printed
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_version_is_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
