@@ -3,6 +3,7 @@ means.
 """
 
 import re
+import tempfile
 from pathlib import Path
 
 from mme_vla.errors import UserError, require
@@ -76,7 +77,7 @@ folder is a run itself, its `latest` is that run. No folder is called so.
 
 
 def check_output(place: str | Path) -> None:
-    """Make sure that `output` has a name, and none that means another folder."""
+    """Make sure that `output` has a name, none that means another folder, and can be made."""
     require(
         str(place).strip(),
         "output= is empty: name the place to write to, such as output=outputs/mine.",
@@ -87,6 +88,18 @@ def check_output(place: str | Path) -> None:
         f"output={folder}: {LATEST!r} is reserved, {folder} means the newest run in"
         f" {folder.parent}. Choose another name.",
     )
+    try:
+        nearest = folder.expanduser().absolute()
+        is_new = not nearest.exists()
+        while not nearest.exists():
+            nearest = nearest.parent
+        if is_new:
+            # Permissions alone do not tell: some file systems take no folders.
+            tempfile.TemporaryDirectory(dir=nearest).cleanup()
+    except OSError as error:
+        raise UserError(
+            f"output={folder} cannot be made: {error.strerror}. Choose another place."
+        ) from error
 
 
 def shipped_checkpoints() -> dict[str, Path]:

@@ -149,6 +149,20 @@ def test_an_empty_output_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("output", ["/proc/mine", "file.txt/mine", "x" * 300])
+def test_an_output_that_cannot_be_made_is_refused_before_anything_is_loaded(
+    output: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file.txt").write_text("mine")
+    printed = reply(["evaluate", "checkpoint=nano", f"output={output}"], monkeypatch, capsys)
+    assert printed.startswith(f"Error: output={output} cannot be made: ")
+    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
+
+
 def test_the_version_is_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
