@@ -134,12 +134,16 @@ def find_run(path: Path) -> Path:
     runs = [run for run in path.parent.glob("*") if newest_write(run)]
     if not runs and newest_write(path.parent):
         return path.parent  # it is a run itself
-    require(
-        runs,
+    if runs:
+        return max(runs, key=lambda run: (newest_write(run), run.name))
+    hint = ""
+    trained = [run for run in Path(OUTPUTS).glob("*/*") if newest_write(run)]
+    if trained:
+        hint = f" Did you mean {max(trained, key=newest_write).parent / LATEST}?"
+    raise UserError(
         f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name"
-        " another.",
+        f" another.{hint}"
     )
-    return max(runs, key=lambda run: (newest_write(run), run.name))
 
 
 def resolve_checkpoint(path: Path) -> Path:
