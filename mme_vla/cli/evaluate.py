@@ -28,6 +28,7 @@ from mme_vla.evaluation.results.events import event_table, idle_events
 from mme_vla.evaluation.results.report import policy_facts
 from mme_vla.evaluation.results.tables import print_table
 from mme_vla.evaluation.rollout.evaluation import (
+    VIDEOS,
     Evaluation,
     RunOptions,
     check_subgoals,
@@ -241,7 +242,9 @@ def report(done: Evaluation) -> None:
         )  # fmt: skip
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
-    logger.info("mme-vla results %s", done.output)
+    if any((done.output / VIDEOS).glob("*.mp4")):
+        logger.info("videos: %s", done.output / VIDEOS)
+    logger.info("next: mme-vla results %s", done.output)
 
 
 def report_usage(usage: Usage) -> None:
