@@ -125,6 +125,17 @@ def test_a_setting_in_a_command_with_options_becomes_one(
         assert expected in " ".join(capsys.readouterr().err.split())
 
 
+def test_each_of_two_mistakes_begins_alike(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["probe", "checkpoint=nano", "offline=false", "max_steps=0"]
+    monkeypatch.setattr(sys, "argv", ["mme-vla", *words])
+    with pytest.raises(SystemExit):
+        entry.main()
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition("=")[0] for line in lines] == ["Error: max_steps", "Error: offline"]
+
+
 def test_the_name_latest_is_reserved(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
