@@ -58,11 +58,16 @@ def require(holds: object, message: str, error: type[Exception] = UserError) -> 
         raise error(message)
 
 
+ERROR = "Error: "
+"""What a command prints before the message of an error."""
+
+
 def check_all(*checks: Callable[[], object]) -> None:
     """Call checks that do not need each other's success, and name all that failed in one error.
 
     Raises:
-        UserError: the messages of the failed checks, one a line.
+        UserError: the messages of the failed checks, one a line. Each line begins as the first
+            does once a command prints it.
     """
     failed = []
     for check in checks:
@@ -70,7 +75,7 @@ def check_all(*checks: Callable[[], object]) -> None:
             check()
         except UserError as error:
             failed.append(text_of(error))
-    require(not failed, "\n".join(failed))
+    require(not failed, f"\n{ERROR}".join(failed))
 
 
 def check_choice(key: str, value: object, options: Iterable[str]) -> None:

@@ -156,17 +156,18 @@ def _check_command_line(config_name: str, tree: Path, check: str) -> None:
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
     _check_bare_words(args.overrides, args.config_name or config_name, tree, extra)
-    for word in args.overrides:
-        key, _, value = word.partition("=")
-        if key == "output":
-            check_output(Path(value))
     name = args.config_name or config_name
     try:
         composed = check_overrides(name, args.overrides, directory=tree, extra_dirs=extra)
     except UserError as error:
         hint = _other_commands(args.overrides, _names(name, tree, extra))
         raise UserError(f"{error}{hint}") from None
+    names_output = any(word.key_or_group == "output" for word in parse(args.overrides))
     for cfg in composed:
+        # not resolved: Hydra knows what `${hydra:…}` means once the command runs
+        output = OmegaConf.to_container(cfg).get("output")  # type: ignore[union-attr]
+        if names_output and output is not None:
+            check_output(str(output))
         # What a plugin registers is known only once it is imported, which `job` does.
         if check and not args.cfg and not cfg.get("plugins") and not OmegaConf.missing_keys(cfg):
             pkgutil.resolve_name(check)(resolved(cfg))

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn, TextIO
 
-from mme_vla.errors import UserError, printable
+from mme_vla.errors import ERROR, UserError, printable
 from mme_vla.utils.io import disk_trouble
 
 DISK_TROUBLE, MISTAKE = 1, 2  # exit codes; a signal's is 128 and its number, as a shell has it
@@ -51,7 +51,7 @@ def print_user_errors() -> Iterator[None]:
                 message = str(error)
             if message is None:
                 raise
-            _print(f"Error: {message}", "Error: ")
+            _print(f"{ERROR}{message}", ERROR)
             raise SystemExit(code) from None
         finally:
             try:
@@ -102,8 +102,9 @@ def _print(text: str, bold: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    remaining = printable(text.removeprefix(bold))
+    shown = Text(printable(text))
+    shown.highlight_regex(f"(?m)^{bold}", "bold red")
     try:
-        Console(stderr=True, soft_wrap=True).print(Text(bold, "bold red"), Text(remaining), sep="")
+        Console(stderr=True, soft_wrap=True).print(shown)
     except OSError:  # the terminal, or the disk that standard error goes to, is what gave way
         sys.stderr = None

@@ -28,6 +28,7 @@ from mme_vla.evaluation.results.events import event_table, idle_events
 from mme_vla.evaluation.results.report import policy_facts
 from mme_vla.evaluation.results.tables import print_table
 from mme_vla.evaluation.rollout.evaluation import (
+    VIDEOS,
     Evaluation,
     RunOptions,
     check_subgoals,
@@ -39,6 +40,7 @@ from mme_vla.evaluation.rollout.evaluation import (
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import total_score
+from mme_vla.evaluation.store import check_run_folder
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
 from mme_vla.policy.run_folders import find_run, trainings_in
@@ -101,6 +103,8 @@ def main(cfg: DictConfig) -> None:
 def evaluate_one(run: EvalRun, training: str = "") -> None:
     """Run the episodes of one policy; `training` is the folder of its records in `output`."""
     settings = run.rollout
+    if run.output is not None:
+        check_run_folder(Path(run.output).expanduser() / training)
     events = event_arms(run.event)
     if run.deterministic:
         # PyTorch takes kernels whose results repeat; where an operation has none, it warns.
@@ -239,7 +243,9 @@ def report(done: Evaluation) -> None:
         )  # fmt: skip
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
-    logger.info("mme-vla results %s", done.output)
+    if any((done.output / VIDEOS).glob("*.mp4")):
+        logger.info("videos: %s", done.output / VIDEOS)
+    logger.info("next: mme-vla results %s", done.output)
 
 
 def report_usage(usage: Usage) -> None:

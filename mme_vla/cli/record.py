@@ -26,7 +26,7 @@ from mme_vla.envs.robomme.recording.own import DRAFT, episode_file, record_own
 from mme_vla.envs.robomme.recording.processes import carry_out, simulation_pool
 from mme_vla.envs.rows import task_options
 from mme_vla.errors import UserError, counted, require
-from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
+from mme_vla.utils import FolderLock, claim_plan, drop_plan, is_vacant, read_json, write_json
 from mme_vla.utils.processes import signals_deferred
 
 if TYPE_CHECKING:  # it imports the simulator, which is asked for first
@@ -301,7 +301,7 @@ def record_environment(run: RecordRun) -> None:
     output = Path(run.output)
     work = _work_folder(run.output)
     require(
-        not output.exists(),
+        is_vacant(output),
         f"{output} exists already; choose another output, or remove it yourself.",
     )
     with FolderLock(work, "recording"):

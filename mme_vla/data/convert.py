@@ -32,7 +32,15 @@ from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.registry import SIDE_FILES
-from mme_vla.utils import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
+from mme_vla.utils import (
+    FolderLock,
+    claim_plan,
+    drop_plan,
+    file_sum,
+    is_vacant,
+    read_json,
+    write_sums,
+)
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
 
 if TYPE_CHECKING:
@@ -304,7 +312,7 @@ def _convert(
 
 
 def _finished(output: Path, plan: dict[str, Any]) -> bool:
-    if not output.exists() or (output.is_dir() and not any(output.iterdir())):
+    if is_vacant(output):
         return False
     side = output / SIDE_FILE
     about = "the facts of a converted dataset"

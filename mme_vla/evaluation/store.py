@@ -25,6 +25,7 @@ from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, complete_compo
 from mme_vla.utils import (
     draft_of,
     is_alive,
+    is_draft,
     name_place,
     read_json,
     read_lines,
@@ -91,6 +92,27 @@ def claim_run(
             " choose another folder."
         )
     return there
+
+
+def check_run_folder(folder: Path) -> None:
+    """Make sure that a folder is new, empty, or holds a run already.
+
+    Raises:
+        UserError: it holds something else.
+    """
+    if (folder / RUN_FILE).exists() or any(folder.glob("episodes*.jsonl")):
+        return
+    require(
+        not folder.exists() or folder.is_dir(),
+        f"output={folder} is a file: name a folder.",
+    )
+    # another process that shares the run may be writing its first file
+    is_empty = not folder.exists() or all(map(is_draft, folder.iterdir()))
+    require(
+        is_empty,
+        f"output={folder} holds files, but no run of this command: choose a new folder, or an"
+        " empty one.",
+    )
 
 
 def read_run(folder: Path) -> dict[str, Any]:

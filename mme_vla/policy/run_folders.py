@@ -3,6 +3,7 @@ means.
 """
 
 import re
+import tempfile
 from pathlib import Path
 
 from mme_vla.errors import UserError, require
@@ -75,13 +76,30 @@ folder is a run itself, its `latest` is that run. No folder is called so.
 """
 
 
-def check_output(folder: Path) -> None:
-    """Make sure that a new folder has no name that means another one."""
+def check_output(place: str | Path) -> None:
+    """Make sure that `output` has a name, none that means another folder, and can be made."""
+    require(
+        str(place).strip(),
+        "output= is empty: name the place to write to, such as output=outputs/mine.",
+    )
+    folder = Path(place)
     require(
         folder.name != LATEST,
         f"output={folder}: {LATEST!r} is reserved, {folder} means the newest run in"
         f" {folder.parent}. Choose another name.",
     )
+    try:
+        nearest = folder.expanduser().absolute()
+        is_new = not nearest.exists()
+        while not nearest.exists():
+            nearest = nearest.parent
+        if is_new:
+            # Permissions alone do not tell: some file systems take no folders.
+            tempfile.TemporaryDirectory(dir=nearest).cleanup()
+    except OSError as error:
+        raise UserError(
+            f"output={folder} cannot be made: {error.strerror}. Choose another place."
+        ) from error
 
 
 def shipped_checkpoints() -> dict[str, Path]:
@@ -116,12 +134,16 @@ def find_run(path: Path) -> Path:
     runs = [run for run in path.parent.glob("*") if newest_write(run)]
     if not runs and newest_write(path.parent):
         return path.parent  # it is a run itself
-    require(
-        runs,
+    if runs:
+        return max(runs, key=lambda run: (newest_write(run), run.name))
+    hint = ""
+    trained = [run for run in Path(OUTPUTS).glob("*/*") if newest_write(run)]
+    if trained:
+        hint = f" Did you mean {max(trained, key=newest_write).parent / LATEST}?"
+    raise UserError(
         f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name"
-        " another.",
+        f" another.{hint}"
     )
-    return max(runs, key=lambda run: (newest_write(run), run.name))
 
 
 def resolve_checkpoint(path: Path) -> Path:

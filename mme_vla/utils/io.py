@@ -173,6 +173,13 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     return place
 
 
+def is_vacant(folder: Path) -> bool:
+    """Whether nothing lies in this place, or an empty folder."""
+    if folder.is_dir():
+        return not any(folder.iterdir())
+    return not folder.exists()
+
+
 def require_replaceable(path: Path, *suffixes: str) -> Path:
     """Return where a command is to write a file, if it destroys nothing but, perhaps, an earlier
     file of the kind.

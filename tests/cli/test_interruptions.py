@@ -226,6 +226,8 @@ def test_a_finished_recording_is_recognised_and_others_are_not(tmp_path: Path) -
     write_file(tmp_path / "record_dataset_Alpha.h5", [4], numbers=[1])
     job = Job("Alpha", 1, seed=98, difficulty="easy", recovery=None, retries=3)
     assert RecordingPlan([job], None, tmp_path).missing(PNG) == []
+    (tmp_path / "empty").mkdir()
+    assert RecordingPlan([job], tmp_path / "empty", None).missing(PNG) == [tmp_path / "empty"]
     other = Job("Alpha", 1, seed=101, difficulty="easy", recovery=None, retries=3)
     with pytest.raises(UserError, match="not what this command records"):
         RecordingPlan([other], None, tmp_path).missing(PNG)

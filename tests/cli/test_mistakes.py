@@ -125,6 +125,17 @@ def test_a_setting_in_a_command_with_options_becomes_one(
         assert expected in " ".join(capsys.readouterr().err.split())
 
 
+def test_each_of_two_mistakes_begins_alike(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["probe", "checkpoint=nano", "offline=false", "max_steps=0"]
+    monkeypatch.setattr(sys, "argv", ["mme-vla", *words])
+    with pytest.raises(SystemExit):
+        entry.main()
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition("=")[0] for line in lines] == ["Error: max_steps", "Error: offline"]
+
+
 def test_the_name_latest_is_reserved(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -132,6 +143,35 @@ def test_the_name_latest_is_reserved(
     printed = reply(["train", "output=outputs/pi05/latest"], monkeypatch, capsys)
     assert "'latest' is reserved" in printed
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["evaluate checkpoint=nano", "train", "convert", "probe"])
+@pytest.mark.parametrize("output", ["output=", "output=''"])
+def test_an_empty_output_is_refused(
+    command: str,
+    output: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    printed = reply([*command.split(), output], monkeypatch, capsys)
+    assert "output= is empty" in printed
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("output", ["/proc/mine", "file.txt/mine", "x" * 300])
+def test_an_output_that_cannot_be_made_is_refused_before_anything_is_loaded(
+    output: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file.txt").write_text("mine")
+    printed = reply(["evaluate", "checkpoint=nano", f"output={output}"], monkeypatch, capsys)
+    assert printed.startswith(f"Error: output={output} cannot be made: ")
+    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
 
 
 def test_the_version_is_printed(

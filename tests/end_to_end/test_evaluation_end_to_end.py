@@ -40,7 +40,8 @@ def test_a_policy_is_evaluated_in_two_parts_with_the_same_results(tmp_path: Path
         f"output={tmp_path / 'whole'}",
         "video=all",
     )
-    assert "mme-vla results" in output
+    folder = tmp_path / "whole"
+    assert f"videos: {folder / 'videos'}\nnext: mme-vla results {folder}\n" in output
     straight = {r.key: (r.outcome, r.steps, r.actions_sha256) for r in records(tmp_path / "whole")}
     assert len(straight) == 4 and len({digest for _, _, digest in straight.values()}) == 4
     assert all(outcome in ("timeout", "fail", "success") for outcome, _, _ in straight.values()), (

@@ -11,8 +11,18 @@ from typing import Any
 import pytest
 
 from mme_vla import UserError
+from mme_vla.cli import evaluate
+from mme_vla.config.composition import compose
 from mme_vla.evaluation.records import EpisodeRecord, Seconds, by_run, merge
-from mme_vla.evaluation.store import RecordLog, claim_run, find_records, read_records, read_run
+from mme_vla.evaluation.store import (
+    RecordLog,
+    check_run_folder,
+    claim_run,
+    find_records,
+    read_records,
+    read_run,
+)
+from mme_vla.utils import draft_of
 
 
 def record(**changes: Any) -> EpisodeRecord:
@@ -166,6 +176,25 @@ def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     ):
         claim_run(tmp_path, other)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
+
+
+def test_a_folder_of_something_else_is_not_filled_with_records(tmp_path: Path) -> None:
+    for name in ("new", "empty", "run", "records", "begun", "foreign"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "new").rmdir()
+    claim_run(tmp_path / "run", {"a": 1})
+    (tmp_path / "records" / "episodes-0.jsonl").write_text("")
+    draft_of(tmp_path / "begun" / "run.json").write_text("")
+    for name in ("new", "empty", "run", "records", "begun"):
+        check_run_folder(tmp_path / name)
+    (tmp_path / "foreign" / "model.yaml").write_text("")
+    with pytest.raises(UserError, match="foreign holds files, but no run"):
+        check_run_folder(tmp_path / "foreign")
+    with pytest.raises(UserError, match=r"model\.yaml is a file"):
+        check_run_folder(tmp_path / "foreign" / "model.yaml")
+    words = ["checkpoint=nano", "tasks=StopCube", f"output={tmp_path / 'foreign'}"]
+    with pytest.raises(UserError, match="holds files, but no run"):
+        evaluate.main(compose("evaluate", words))
 
 
 def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:

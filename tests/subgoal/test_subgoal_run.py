@@ -144,3 +144,19 @@ def test_a_task_named_all_keeps_its_row_beside_that_of_all_episodes(
     report(done)  # type: ignore[arg-type]
     lines = [line for line in capsys.readouterr().out.splitlines() if " all " in line]
     assert ["100.0 %" in lines[0], "50.0 %" in lines[1], len(lines)] == [True, True, 2]
+
+
+def test_a_run_ends_with_the_place_of_its_videos_and_the_next_command(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    done = SimpleNamespace(
+        records=[], matched=[], workload=SimpleNamespace(batches=0), output=tmp_path
+    )
+    following = f"next: mme-vla results {tmp_path}"
+    with caplog.at_level("INFO", "mme_vla.evaluate"):
+        report(done)  # type: ignore[arg-type]
+        assert caplog.messages == [following]
+        (tmp_path / "videos").mkdir()
+        (tmp_path / "videos" / "StopCube_ep0_success.mp4").touch()
+        report(done)  # type: ignore[arg-type]
+    assert caplog.messages[1:] == [f"videos: {tmp_path / 'videos'}", following]

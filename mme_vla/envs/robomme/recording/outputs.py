@@ -17,7 +17,7 @@ from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.errors import require
-from mme_vla.utils import read_json, remove_drafts, write_atomically
+from mme_vla.utils import is_vacant, read_json, remove_drafts, write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
@@ -173,7 +173,7 @@ class RecordingPlan:
         """The places that are still to be written; what is there holds exactly these episodes."""
         missing = []
         for place in self.places:
-            if not place.exists():
+            if is_vacant(place):
                 missing.append(place)
                 continue
             if place == self.dataset:
