@@ -21,6 +21,7 @@ from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.evaluation import choose_shard
 from mme_vla.extras.nano.board import MATCHED
 from mme_vla.extras.nano.demonstrations import Scene, demonstrated
 from mme_vla.extras.nano.evaluating import (
@@ -56,6 +57,7 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
     """
     until = STAGES.index(nano.stage)
     folder = Path(nano.output)
+    check_evaluation(nano)
     rows = compose_rows(nano, extra_dirs)
     folder.mkdir(parents=True, exist_ok=True)
     minutes = Minutes(folder / "clock.json")
@@ -231,6 +233,22 @@ def rules_of(nano: NanoRun) -> "Rules":
         workers=nano.workers,
         shard=nano.shard,
     )
+
+
+def check_evaluation(nano: NanoRun) -> None:
+    """Make sure that the episodes exist: they are chosen only after hours of recording and
+    training.
+    """
+    choose_shard(nano.shard)
+    amounts = [nano.episodes]
+    if nano.also and nano.also_episodes is not None:
+        amounts.append(nano.also_episodes)
+    for episodes in amounts:
+        require(
+            isinstance(episodes, int) or not nano.replace,
+            f"episodes={episodes}: with replace=true write how many scenes of each task.",
+        )
+        choose_episodes(nano.task, episodes, nano.split)
 
 
 def episodes_of(nano: NanoRun, folder: Path, episodes: Any) -> list[EpisodeSpec]:
