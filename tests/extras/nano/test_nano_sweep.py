@@ -150,6 +150,22 @@ def test_what_is_evaluated_is_checked_before_anything_is_recorded(
     assert not (tmp_path / "run").exists()
 
 
+def test_what_is_recorded_is_said_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def demonstrate(*_: Any) -> list[Path]:
+        said.extend(caplog.messages)
+        return []
+
+    said: list[str] = []
+    monkeypatch.setattr(runs, "demonstrate", demonstrate)
+    caplog.set_level("INFO", "mme_vla.nano")
+    words = ["task=VideoUnmask", "demonstrations={easy: 120, hard: 30}", "stage=record"]
+    words.append(f"output={tmp_path / 'run'}")
+    runs.run(NanoRun.from_config(resolved(compose("nano", words))))
+    assert said == ["300 demonstrations: 120 easy, 150 medium, 30 hard"]
+
+
 def test_minutes_of_a_stage_add_up_over_runs(tmp_path: Path) -> None:
     minutes = runs.Minutes(tmp_path / "clock.json")
     for stage in ("training", "evaluation", "training"):
