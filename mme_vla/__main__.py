@@ -31,7 +31,8 @@ def main() -> None:
         return
     if name not in commands():
         with print_user_errors():
-            raise UserError(f"There is no command {name!r}. {did_you_mean(name, commands())}")
+            near = did_you_mean(name, commands(), "mme-vla --help")
+            raise UserError(f"There is no command {name!r}. {near}")
     sys.argv = [f"mme-vla {name}", *words]
     run(name)
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 CONSTRAINTS = Path(__file__).resolve().parents[1] / "constraints.txt"
 """The versions known to work together, in a clone."""
+LONG = 12
+"""Names that a message lists beside a good guess, at most, where a command lists them all."""
 
 
 class UserError(ValueError):
@@ -119,8 +121,11 @@ def check_known(kind: str, value: object, known: Iterable[str]) -> None:
         raise UserError(f"Unknown {kind} {value!r}. {did_you_mean(str(value), names)}")
 
 
-def did_you_mean(name: str, options: Iterable[str]) -> str:
+def did_you_mean(name: str, options: Iterable[str], listed_by: str = "") -> str:
     """Return a sentence that lists `options`, with the ones nearest to `name` first in line.
+
+    listed_by: the command that lists them; it stands for a list of more than `LONG` where some are
+    near.
 
     >>> did_you_mean("tokendrp", ["framesamp", "tokendrop"])
     "Did you mean 'tokendrop'? Known: framesamp, tokendrop."
@@ -129,6 +134,8 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     # the time it takes grows with the square
     near = get_close_matches(name[:200], known, n=3, cutoff=0.6)
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
+    if near and listed_by and len(known) > LONG:
+        return f"{hint}`{listed_by}` lists all {len(known)}."
     return f"{hint}Known: {', '.join(known) or 'none'}."
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mme_vla import errors
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import LONG, UserError, did_you_mean, missing_extra
 
 
 def test_the_middle_of_an_overlong_message_is_left_out() -> None:
@@ -37,3 +37,15 @@ def test_a_missing_extra_of_the_installed_wheel_is_installed_by_the_name_of_the_
         "The simulator needs the extra `sim`. With pip: pip install 'mme-vla[sim]'"
         " (with uv: uv pip install 'mme-vla[sim]')."
     )
+
+
+def test_a_long_list_of_names_is_left_to_a_command_where_one_is_near() -> None:
+    names = [f"model_{number}x" for number in range(LONG)]
+    assert did_you_mean("model_3", names, "--help model").endswith(
+        f"Known: {', '.join(sorted(names))}."
+    )
+    names.append("framesamp")
+    guess = did_you_mean("framesmp", names, "--help model")
+    assert guess == "Did you mean 'framesamp'? `--help model` lists all 13."
+    assert "Known: framesamp, model_0x" in did_you_mean("pi", names, "--help model")
+    assert "Known: framesamp, model_0x" in did_you_mean("framesmp", names)

@@ -147,7 +147,8 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
         raise UserError(f"{group!r} is no group of this command. {did_you_mean(group, groups)}")
     files = yaml_files(trees, group)
     if name and name not in files:
-        raise UserError(f"Unknown {group} {name!r}. {did_you_mean(name, files)}")
+        near = did_you_mean(name, files, f"--help {group}")
+        raise UserError(f"Unknown {group} {name!r}. {near}")
     if name:
         files = {name: files[name]}
     parts = [f"Group {group}, by default {group}={groups[group]}"]

@@ -58,7 +58,9 @@ class ConfigTree:
                 return str(missing_extra(f"launcher={name}", "sweep"))
             options = error.options or self.loader.get_group_options(group)
             text = f"Unknown {group or 'config'} {name!r}."
-            known = did_you_mean(name, options)
+            # the models of nano and of Python are composed apart, from the tree `policy`
+            command = "mme-vla train " if self.config_name == "policy" else ""
+            known = did_you_mean(name, options, f"{command}--help {group}" if group else "")
             file = nearby_file(group, name) if group else None
             if file is not None:
                 folder = file.parents[len(Path(group).parts)]

@@ -46,6 +46,8 @@ def reply(
         ("evaluate nano", "Did you mean checkpoint=nano or"),
         ("evaluate checkpoint = nano", "write checkpoint=nano, without spaces around =."),
         ("trian model=pi05", "Error: There is no command 'trian'. Did you mean 'train'?"),
+        ("train model=framesamp_modl", "or 'keyframes_modul'? `--help model` lists all"),
+        ("nano model=framesamp_modl", "? `mme-vla train --help model` lists all"),
         ("results x --epsiodes 3", "There is no option '--epsiodes'. Did you mean '--episodes'?"),
         ("results x --errors fail", "--errors 'fail' is not known. Did you mean 'failure'?"),
         ("results verify", "A value is needed for receipt (receipt: receipt.json, or a folder"),

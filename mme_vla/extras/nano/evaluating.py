@@ -322,10 +322,6 @@ def built_scenes(
 
     file: keeps both, so that they are looked for once.
     """
-    require(
-        isinstance(count, int),
-        f"episodes={count}: with replace=true write how many scenes of each task.",
-    )
     # Episode → why its scene cannot be built, empty if it can
     tried: dict[str, str] = {}
     if file.is_file():

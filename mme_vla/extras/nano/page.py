@@ -4,7 +4,7 @@ curves.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, compress
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from mme_vla.evaluation.results.compare import (
 )
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, wilson
-from mme_vla.evaluation.results.tables import comparison_table, to_markdown
+from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
 from mme_vla.extras.nano.evaluating import PLANNER
 from mme_vla.extras.nano.fitting import learning_curve
 from mme_vla.extras.nano.rows import TRAINED
@@ -33,6 +33,7 @@ from mme_vla.utils.style import figure, legend, log_scale
 
 PAGE, CURVES = "page.md", "learning.png"
 FEW_POINTS = 12  # of a curve, below which each has a marker
+FEW_EPISODES = 100  # below which a percentage says more than was seen, and counts stand beside it
 
 
 def write_page(
@@ -66,11 +67,10 @@ def write_page(
         "nano.md",
         config=nano.config,
         demonstrations=demonstrations,
-        seeds=str(nano.policy_seed),
-        planner=PLANNER,
+        planner=PLANNER if PLANNER in records else None,
         without=without,
         success=success_table(records, ends, results),
-        comparison=to_markdown(comparison_table(comparisons)) if comparisons else "",
+        comparison=to_markdown(pairs_table(comparisons)) if comparisons else "",
         lead=[comparison.verdict for comparison in comparisons] or [solved(records)],
         notes=results.notes,
         minutes={stage: spent for stage, spent in minutes.items() if round(spent, 1) > 0},
@@ -147,6 +147,19 @@ def compared(
     return results, comparisons
 
 
+def pairs_table(comparisons: Sequence[Comparison]) -> Table:
+    """The table of comparisons; of few episodes with the number solved of each side."""
+    table = comparison_table(comparisons)
+    for comparison, row in zip(comparisons, table.rows, strict=True):
+        if comparison.paired and comparison.episodes < FEW_EPISODES:
+            counts = (comparison.first_solved, comparison.second_solved)
+            for column, count in zip(("first", "second"), counts, strict=True):
+                rate = 100 * count / comparison.episodes
+                text = f"{count:.3g} of {comparison.episodes} ({rate:.0f} %)"
+                row[table.columns.index(column)] = text
+    return table
+
+
 def _method(results: Results, record: EpisodeRecord) -> Method:
     """The method to which a record's run belongs."""
     for method in results.methods:
@@ -169,7 +182,7 @@ def success_table(
     """
     columns = ["memory tokens", "all", "95 % interval", *DIFFICULTIES]
     columns += ["off by, held out", "within 2 cm"]
-    lines = ["| model | " + " | ".join(columns) + " |", "| --- " + "| ---: " * len(columns) + "|"]
+    rows = []
     for model, model_records in records.items():
         # Success with its interval
         won = sum(record.success for record in model_records)
@@ -201,8 +214,12 @@ def success_table(
             cells += [f"{100 * np.median(distances):.1f} cm", f"{within:.0f} %"]
         else:
             cells += ["", ""]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append(cells)
+    # A run of easy scenes has no columns of the others.
+    filled = [any(column) for column in zip(*rows, strict=True)]
+    rows = [list(compress(cells, filled)) for cells in (["model", *columns], *rows)]
+    rows.insert(1, ["---", *["---:"] * (sum(filled) - 1)])
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
 
 
 def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> bool:

@@ -4,6 +4,7 @@ skipped.
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,8 +20,9 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.robomme.recording.frames import DECISIONS, FrameChoice
 from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief, counted, require
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.evaluation import choose_shard
 from mme_vla.extras.nano.board import MATCHED
 from mme_vla.extras.nano.demonstrations import Scene, demonstrated
 from mme_vla.extras.nano.evaluating import (
@@ -56,6 +58,7 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
     """
     until = STAGES.index(nano.stage)
     folder = Path(nano.output)
+    check_evaluation(nano)
     rows = compose_rows(nano, extra_dirs)
     folder.mkdir(parents=True, exist_ok=True)
     minutes = Minutes(folder / "clock.json")
@@ -233,6 +236,22 @@ def rules_of(nano: NanoRun) -> "Rules":
     )
 
 
+def check_evaluation(nano: NanoRun) -> None:
+    """Make sure that the episodes exist: they are chosen only after hours of recording and
+    training.
+    """
+    choose_shard(nano.shard)
+    amounts = [nano.episodes]
+    if nano.also and nano.also_episodes is not None:
+        amounts.append(nano.also_episodes)
+    for episodes in amounts:
+        require(
+            isinstance(episodes, int) or not nano.replace,
+            f"episodes={episodes}: with replace=true write how many scenes of each task.",
+        )
+        choose_episodes(nano.task, episodes, nano.split)
+
+
 def episodes_of(nano: NanoRun, folder: Path, episodes: Any) -> list[EpisodeSpec]:
     """Those episodes of the split; with `replace` scenes that cannot be built are replaced by later
     ones.
@@ -280,6 +299,19 @@ def counts_of(
     return counts
 
 
+def plan_text(counts: Mapping[tuple[str, str], int]) -> str:
+    """What is recorded in a line, as the difficulties that a command leaves out keep their numbers.
+
+    >>> plan_text({("StopCube", "easy"): 120, ("StopCube", "hard"): 30})
+    '150 demonstrations: 120 easy, 30 hard'
+    """
+    levels: Counter[str] = Counter()
+    for (_, level), amount in counts.items():
+        levels[level] += amount
+    parts = [f"{levels[level]:,} {level}" for level in DIFFICULTIES if levels[level]]
+    return f"{counted(levels.total(), 'demonstration')}: {', '.join(parts)}"
+
+
 def record_all(
     nano: NanoRun, folder: Path, choices: Sequence[FrameChoice], robot: Embodiment
 ) -> list[Path]:
@@ -291,6 +323,7 @@ def record_all(
     """
     groups = []
     counts = counts_of(nano.task, nano.demonstrations, nano.demonstrations_of)
+    logger.info(plan_text(counts))
     for (task, level), required in counts.items():
         (folder / task).mkdir(parents=True, exist_ok=True)
         first = nano.first_seed + DIFFICULTIES.index(level) * SEEDS_APART

@@ -510,11 +510,16 @@ def _videos(folder: Path) -> list[tuple[str, str]]:
 
 
 def _terms_of(tables: Sequence[Table], meanings: Mapping[str, str]) -> list[tuple[str, str]]:
-    """The measures and arms that some tables have a row of, and what they mean."""
+    """The measures and arms that some tables have a row of, the columns of the arms, and what they
+    mean.
+    """
     questions = {name: question for name, (_, question) in MEASURES.items()}
-    known = {**questions, **dict([REACH, FROM_VIDEO]), **meanings}
+    of_columns = dict([*COLUMNS, *LOOP_COLUMNS[1:]])  # but that of the arms' names
+    known = {**of_columns, **questions, **dict([REACH, FROM_VIDEO]), **meanings}
     names: dict[str, None] = {}
     for table in tables:
+        if table.columns[0] == "arm":
+            names |= dict.fromkeys(name for name in table.columns if name in of_columns)
         if table.columns[0] in ("arm", "measure"):
             names |= dict.fromkeys(row[0] for row in table.rows)
     return [(name, known[name]) for name in names if known.get(name)]

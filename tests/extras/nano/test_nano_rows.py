@@ -266,9 +266,10 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     page = write_page(
         tmp_path, config, runs, "pi05", {"videos": 2.0, "planner": 0.0}, [video], folders, 7
     ).read_text()
-    assert (
-        "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
-    )
+    assert "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 | 2.0 cm | 67 % |" in page
+    assert "medium" not in page, "a column without episodes is left out"
+    assert "Brackets: `planner`" in page and "once for seed 7 of" in page
+    assert "| ttt_modul@4 − pi05 | 50 of 100 | 20 of 50 (40 %) |" in page
     assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
     assert (
         "framesamp_modul@4 − pi05" in page
@@ -288,6 +289,11 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         "framesamp_modul: off by 2.0 cm on held-out decisions, 60 of 100 episodes solved"
     )
     assert lines[-1] == "planner: 100 of 100 episodes solved"
+
+    without = {"framesamp_modul": runs["framesamp_modul"]}
+    folders = {"framesamp_modul": folders["framesamp_modul"]}
+    page = write_page(tmp_path, config, without, None, {}, [], folders, 7).read_text()
+    assert "planner" not in page and "noise. No policy without memory was run." in page
 
 
 def test_a_run_without_held_out_losses_has_no_learning_curve(tmp_path):

@@ -2,6 +2,7 @@
 table.
 """
 
+import re
 import shutil
 import time
 from dataclasses import replace
@@ -126,6 +127,43 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     shutil.rmtree(killed / "checkpoints")
     runs.run(NanoRun.from_config(resolved(compose("nano", words))))
     assert read_json(killed / "trained.json", "a training's end")["steps"] == 2
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("split=further_ez", "Unknown split 'further_ez'. Did you mean 'further'"),
+        ("task=VideoUmask", "Unknown task 'VideoUmask'"),
+        ("episodes=101", "episodes=101 means the first 101; VideoUnmask in 'further' has 100"),
+        ("also_episodes=101", "episodes=101 means the first 101"),
+        ("replace=true", "episodes=all: with replace=true write how many scenes"),
+        ("shard=2/2", "shard='2/2'"),
+    ],
+)
+def test_what_is_evaluated_is_checked_before_anything_is_recorded(
+    word: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs, "record_all", lambda *_: pytest.fail("it records"))
+    words = ["task=VideoUnmask", "also=[ttt_modul]", f"output={tmp_path / 'run'}", word]
+    with pytest.raises(UserError, match=re.escape(says)):
+        runs.run(NanoRun.from_config(resolved(compose("nano", words))))
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_recorded_is_said_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def demonstrate(*_: Any) -> list[Path]:
+        said.extend(caplog.messages)
+        return []
+
+    said: list[str] = []
+    monkeypatch.setattr(runs, "demonstrate", demonstrate)
+    caplog.set_level("INFO", "mme_vla.nano")
+    words = ["task=VideoUnmask", "demonstrations={easy: 120, hard: 30}", "stage=record"]
+    words.append(f"output={tmp_path / 'run'}")
+    runs.run(NanoRun.from_config(resolved(compose("nano", words))))
+    assert said == ["300 demonstrations: 120 easy, 150 medium, 30 hard"]
 
 
 def test_minutes_of_a_stage_add_up_over_runs(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The first sentence of a probe's page: what was found, or that it is too little to tell."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -9,7 +10,7 @@ from mme_vla.evaluation.results.statistics import Interval, sign_test
 from mme_vla.extras.probing.conclusions import conclude
 from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import EntryLine, MomentLine
-from mme_vla.extras.probing.report import phase_name, phases_table
+from mme_vla.extras.probing.report import COLUMNS, phase_name, phases_table, write_page
 
 LINE = MomentLine("r/0", "VideoUnmask", 20, 0, "", "drop:all", None, 4, [16], 1.0, 0.1, 0.5)
 ENTRY = EntryLine("r/0", "VideoUnmask", 20, 0, "memory", 0, 4, 16, True, 0.2, 0.1)
@@ -156,6 +157,14 @@ def test_a_sentence_says_what_the_closed_loop_shows(
     comparisons: list[Comparison], sentence: str
 ) -> None:
     assert conclude(Findings([], []), comparisons) == sentence
+
+
+def test_the_terminal_explains_the_columns_of_its_tables(tmp_path: Path) -> None:
+    write_page(tmp_path, "nano", 100, Findings(moments([1.0, 0.9]), []))
+    text = (tmp_path / "table.md").read_text()
+    for name, meaning in COLUMNS:
+        assert f"- `{name}`: {meaning}" in text
+    assert "`significant`" not in text, "there is no closed loop"
 
 
 def test_sub_tasks_are_called_by_the_words_that_their_texts_share() -> None:
