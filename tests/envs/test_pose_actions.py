@@ -221,8 +221,8 @@ def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(
     frames, _, terminated, _, report = env.step(Command(actions))
     env.close()
     assert terminated and report.status == "success"
-    assert len(frames["state"]) == report.steps >= report.executed
-    assert (report.steps == report.executed) == (panda.action.frames == 1)
+    assert len(frames["state"]) == report.frames >= report.executed
+    assert (report.frames == report.executed) == (panda.action.frames == 1)
 
 
 def test_files_without_poses_or_choices_convert_as_before(tmp_path: Path) -> None:

@@ -195,7 +195,7 @@ class ChunkEnv:
 
         draw: the requested images; by default all.
         """
-        self._ask(draw)
+        self._request_images(draw)
         with self._simulation():
             observation, info = self._env.reset()
         frames = Frames(self._robot)
@@ -203,8 +203,8 @@ class ChunkEnv:
         self._note_pose(observation)
         self._note_subgoal(info)
         self._note_goal(info)
-        self._draw_reset(frames, count)
-        self._returned = frames.leave(draw, 0)
+        self._add_reset_to_video(frames, count)
+        self._returned = frames.blank_unrequested(draw, 0)
         # Environments of other packages do not know their scene.
         self._scene = getattr(self._env, "scene_digest", NO_VALUES)
         return frames.observation(), self._report(info)
@@ -233,7 +233,7 @@ class ChunkEnv:
             if draw is not None and number < len(actions):
                 # Only the chunk's last frame is the newest when the policy reads it.
                 request = replace(draw, now=())
-            self._ask(request)
+            self._request_images(request)
             with self._simulation():
                 observation, reward, ended, cut, info = self._env.step(self._command(action))
             terminated = bool(ended)
@@ -259,10 +259,10 @@ class ChunkEnv:
                 info = {**info, "status": "timeout"}
             self._note_goal(info)
             outcome = str(info.get("status")) if terminated or truncated else None
-            self._draw(frames, count, command.subgoal, outcome)
+            self._add_to_video(frames, count, command.subgoal, outcome)
             if terminated or truncated:
                 break
-        self._returned = frames.leave(draw, self._returned)
+        self._returned = frames.blank_unrequested(draw, self._returned)
         report = replace(self._report(info), executed=executed, frames=n_frames)
         if command.hold:
             report = replace(report, held=self._hold_action())
@@ -316,7 +316,7 @@ class ChunkEnv:
         if poses := observation["eef_state_list"]:
             self._pose = np.asarray(poses[-1], np.float64)
 
-    def _ask(self, request: RenderRequest | None) -> None:
+    def _request_images(self, request: RenderRequest | None) -> None:
         # A video shows everything; and not every environment can leave images out.
         if self._video is None and hasattr(self._env, "render_request"):
             self._env.render_request = request
@@ -362,7 +362,7 @@ class ChunkEnv:
         self._simulating = self._rendered = 0.0
         return report
 
-    def _draw_reset(self, frames: "Frames", count: int) -> None:
+    def _add_reset_to_video(self, frames: "Frames", count: int) -> None:
         """Add the conditioning video, and the current frame, to the episode's video."""
         if self._video is None:
             return
@@ -372,7 +372,9 @@ class ChunkEnv:
                 caption = "step 0"
             self._video.add(views, self._goal, caption, demo=number < count)
 
-    def _draw(self, frames: "Frames", count: int, subgoal: str | None, outcome: str | None) -> None:
+    def _add_to_video(
+        self, frames: "Frames", count: int, subgoal: str | None, outcome: str | None
+    ) -> None:
         """Add the frames of an action. outcome: of the episode that it ended."""
         if self._video is None:
             return
@@ -427,14 +429,18 @@ class Frames:
             readings += observation[f"{name}_list"]
         return len(states)
 
-    def leave(self, draw: RenderRequest | None, first: int) -> int:
-        """Leave out the images that were not requested; from the first frame's number to the one
-        that follows.
+    def blank_unrequested(self, request: RenderRequest | None, first: int) -> int:
+        """Leave out the images that were not requested.
+
+        first: the number of the first frame.
+
+        Returns:
+            The number that follows the last one's.
         """
         stop = first + len(self._states)
-        if draw is not None:
+        if request is not None:
             for frame in range(first, stop):
-                cameras = draw.cameras(frame, newest=frame == stop - 1)
+                cameras = request.cameras(frame, newest=frame == stop - 1)
                 for name in self._cameras:
                     if name not in cameras:
                         self._images[name][frame - first] = None

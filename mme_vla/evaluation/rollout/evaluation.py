@@ -75,18 +75,18 @@ def choose_episodes(
     ]
 
 
-def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
+def choose_shard(text: str | None, variables: Mapping[str, str] | None = None) -> Shard:
     """Read `0/4` (the first of four), or the rank of this process under torchrun.
 
-    text: wins over the environment.
-    environment: by default the process's own.
+    text: wins over them.
+    variables: of the environment; None: the process's own.
     """
-    if environment is None:
-        environment = os.environ
+    if variables is None:
+        variables = os.environ
     if text is None:
-        if "RANK" not in environment or "WORLD_SIZE" not in environment:
+        if "RANK" not in variables or "WORLD_SIZE" not in variables:
             return Shard()
-        text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
+        text = f"{variables['RANK']}/{variables['WORLD_SIZE']}"
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
     if match is None or int(match[1]) >= int(match[2]):
         raise UserError(
