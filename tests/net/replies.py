@@ -97,7 +97,7 @@ record episodes=1 output=new
 record task=PickXtimes output=new
 record task=PickXtimes episodes=1
 record task=PickXtimes episodes=one output=new
-record task=PickXtimes episodes=1 output=empty
+record task=PickXtimes episodes=1 output=not_a_dataset
 record task=PickXtimes episodes=1 output=new split=validation
 record task=PickXtimes episodes=1 output=new images=gif
 record task=PickXtimes episodes=1 output=new frames=some
