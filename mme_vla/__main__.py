@@ -31,8 +31,7 @@ def main() -> None:
         return
     if name not in commands():
         with print_user_errors():
-            near = did_you_mean(name, commands(), "mme-vla --help")
-            raise UserError(f"There is no command {name!r}. {near}")
+            raise UserError(f"There is no command {name!r}. {did_you_mean(name, commands())}")
     sys.argv = [f"mme-vla {name}", *words]
     run(name)
 

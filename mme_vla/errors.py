@@ -6,7 +6,7 @@ from pathlib import Path
 
 CONSTRAINTS = Path(__file__).resolve().parents[1] / "constraints.txt"
 """The versions known to work together, in a clone."""
-LONG = 12
+LONG = 20
 """Names that a message lists beside a good guess, at most, where a command lists them all."""
 
 

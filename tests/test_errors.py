@@ -46,6 +46,6 @@ def test_a_long_list_of_names_is_left_to_a_command_where_one_is_near() -> None:
     )
     names.append("framesamp")
     guess = did_you_mean("framesmp", names, "--help model")
-    assert guess == "Did you mean 'framesamp'? `--help model` lists all 13."
+    assert guess == "Did you mean 'framesamp'? `--help model` lists all 21."
     assert "Known: framesamp, model_0x" in did_you_mean("pi", names, "--help model")
     assert "Known: framesamp, model_0x" in did_you_mean("framesmp", names)

@@ -109,11 +109,14 @@ def phases_table(findings: Findings) -> Table | None:
     return Table("By task and sub-task", ("task and sub-task", *arms), rows)
 
 
+CUBE_COLOURS = {"red", "blue", "green"}
+
+
 def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
     """The name of a sub-task: its number, and the words that its texts share."""
-    name = f"{phase + 1}"
+    name = f"sub-task {phase + 1}"
     if task:
-        name = f"{task} {name}"
+        name = f"{task}, {name}"
     texts = sorted({line.subgoal for line in lines if line.subgoal})
     if not texts:
         return name
@@ -123,6 +126,8 @@ def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
     shared: list[str] = []
     for column in zip(*words, strict=True):
         word = column[0] if len(set(column)) == 1 else "…"
+        if word == "…" and CUBE_COLOURS.issuperset(column):
+            word = "named"  # by the goal: the text is whole without its colour
         if word != "…" or shared[-1:] != ["…"]:
             shared.append(word)
     return f"{name}: {' '.join(shared)}"
