@@ -45,6 +45,8 @@ def progress(
     """Show a bar of `total` steps, `done` of them finished before; the yielded function advances
     it.
 
+    unit: what a step is, in the plural.
+
     Where no terminal is, a line says what is finished: at most one every `LINE_SECONDS`, and one
     after the last step.
     """
@@ -57,6 +59,8 @@ def progress(
         TimeRemainingColumn,
     )
 
+    if total == 1:
+        unit = unit.removesuffix("s")
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     if not (console.is_terminal and console.file.isatty()):
         # FORCE_COLOR makes the first true, in notebooks too

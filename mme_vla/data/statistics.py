@@ -72,7 +72,7 @@ def compute_norm_stats(
     batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)
     kind = ExactStats if exact else RunningStats
     states, actions = kind(), kind()
-    with progress("statistics", batches, unit="batches") as advance:
+    with progress("statistics", batches) as advance:
         for i in range(batches):
             of_batch, chunks = [], []
             for s, episode, step in steps[i * BATCH : (i + 1) * BATCH].tolist():

@@ -34,3 +34,9 @@ def test_time_left_does_not_count_what_comes_before_the_first_step(monkeypatch, 
             advance(steps)
     line = Text.from_ansi(capsys.readouterr().err).plain.splitlines()[0]
     assert line == "record: 510 of 1,000 in 20 s, about 49 s left"
+
+
+def test_a_single_step_is_named_in_the_singular(capsys) -> None:
+    with progress("show", total=1, unit="tasks") as advance:
+        advance(1)
+    assert Text.from_ansi(capsys.readouterr().err).plain.startswith("show: 1 of 1 task in")
