@@ -27,6 +27,7 @@ COMMANDS = {
         "what a checkpoint or a dataset holds, and predicted against recorded actions",
         config="inspect",
         processes="any",
+        check="mme_vla.policy.run_folders:check_checkpoint",
     ),
     "serve": Command(
         "mme_vla.cli.serve",

@@ -4,7 +4,9 @@ means.
 
 import re
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from mme_vla.errors import UserError, require
 from mme_vla.registry import extensions
@@ -144,6 +146,12 @@ def find_run(path: Path) -> Path:
         f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name"
         f" another.{hint}"
     )
+
+
+def check_checkpoint(config: Mapping[str, Any]) -> None:
+    """Check that the checkpoint of a command's configuration is there, without PyTorch."""
+    if config["checkpoint"] is not None:
+        resolve_checkpoint(Path(str(config["checkpoint"])))
 
 
 def resolve_checkpoint(path: Path) -> Path:

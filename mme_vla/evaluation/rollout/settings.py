@@ -8,6 +8,7 @@ from typing import Any, Literal, Self, TypedDict
 
 from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_section
 from mme_vla.envs.base import environment
+from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.policy.run_folders import check_on_machine, find_run
 
@@ -112,13 +113,15 @@ class RolloutKeywords(TypedDict, total=False):
 
 
 def check_config(config: Mapping[str, Any]) -> None:
-    """Check what a command's configuration says of rollouts, tasks and checkpoint, without PyTorch.
+    """Check what a command's configuration says of rollouts, tasks, episodes and checkpoint, without
+    PyTorch.
 
     Args:
         config: plain and resolved, of a command that has the keys of configs/evaluate.yaml.
     """
     # Each event is a run of its own, which the command checks.
-    RolloutSettings.from_config({**config, "event": None})
+    settings = RolloutSettings.from_config({**config, "event": None})
+    choose_episodes(named_tasks(config), config["episodes"], settings.split, settings.env)
     checkpoint = config["checkpoint"]
     if checkpoint is not None:
         check_on_machine(find_run(Path(str(checkpoint)).expanduser()))
