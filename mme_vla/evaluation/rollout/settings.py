@@ -113,8 +113,7 @@ class RolloutKeywords(TypedDict, total=False):
 
 
 def check_config(config: Mapping[str, Any]) -> None:
-    """Check what a command's configuration says of rollouts, tasks, episodes and checkpoint, without
-    PyTorch.
+    """Check rollouts, tasks, episodes and checkpoint of a command's configuration, without PyTorch.
 
     Args:
         config: plain and resolved, of a command that has the keys of configs/evaluate.yaml.
