@@ -198,6 +198,7 @@ def test_the_version_is_printed(
         ("inspect checkpoint=missing", "No checkpoint at missing: there is no such folder"),
         ("serve checkpoint=nano port=80000", "port=80000 must be a whole number from 0 to 65535"),
         ("nano task=VideoUnmask model=nope", "Unknown model 'nope'."),
+        ("nano task=VideoUnmask split=further_ez", "Unknown split 'further_ez'. Did you mean"),
         ("train model=framesamp_modul memory.budget=100", "choose a multiple of 16, such as 96."),
         ("evaluate checkpoint=missing", "No checkpoint at missing: there is no such folder."),
         ("probe checkpoint=nano recordings=sample with=[dropall]", "Did you mean 'drop'?"),

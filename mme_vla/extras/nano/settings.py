@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, get_args
 
 from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, read_section
+from mme_vla.envs.episodes import choose_episodes
+from mme_vla.errors import require
 
 Stage = Literal["record", "tokens", "train", "evaluate", "all"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
@@ -92,3 +94,18 @@ class NanoRun:
     def is_further(self, row: str) -> bool:
         """Whether a row is one of `also`, which have fewer trainings and episodes."""
         return row.partition("@")[0] in self.also
+
+
+def check_episodes(nano: NanoRun) -> None:
+    """Make sure, without PyTorch, that the episodes exist: they are chosen only after hours of
+    recording and training.
+    """
+    amounts = [nano.episodes]
+    if nano.also and nano.also_episodes is not None:
+        amounts.append(nano.also_episodes)
+    for episodes in amounts:
+        require(
+            isinstance(episodes, int) or not nano.replace,
+            f"episodes={episodes}: with replace=true write how many scenes of each task.",
+        )
+        choose_episodes(nano.task, episodes, nano.split)
