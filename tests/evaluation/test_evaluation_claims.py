@@ -197,6 +197,17 @@ def test_an_episode_that_is_tried_again_comes_last() -> None:
     assert [taken(waiting.take()) for _ in range(3)] == [1, 0, None]
 
 
+def test_nothing_is_said_of_equal_runs_that_end_alike() -> None:
+    protocol = Protocol(("BinFill",), 2)
+    twice = [record(0), record(1), record(0), record(1)]
+    other = [EpisodeRecord("else", 1, 7, "BinFill", i, 1, "easy", "fail", 5) for i in range(2)]
+    results = aggregate([*twice, *other], protocol, conflicts="first")
+    method = results.method("tiny")
+    assert (method.repeated, method.flipped) == (2, 0)
+    assert not any("more than once" in note for note in results.notes)
+    assert "twice" not in compare(method, results.method("else"), protocol).verdict
+
+
 def test_episodes_that_end_otherwise_between_equal_runs_are_counted() -> None:
     protocol = Protocol(("BinFill",), 4)
     once = [record(i) for i in range(4)]

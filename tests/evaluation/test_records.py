@@ -13,7 +13,7 @@ import pytest
 from mme_vla import UserError
 from mme_vla.cli import evaluate
 from mme_vla.config.composition import compose
-from mme_vla.evaluation.records import EpisodeRecord, Seconds, by_run, merge
+from mme_vla.evaluation.records import ARM, EpisodeRecord, Seconds, by_run, display_name, merge
 from mme_vla.evaluation.store import (
     RecordLog,
     check_run_folder,
@@ -23,6 +23,13 @@ from mme_vla.evaluation.store import (
     read_run,
 )
 from mme_vla.utils import draft_of
+
+
+def test_a_shipped_policy_is_called_as_the_user_typed_it() -> None:
+    model = "framesamp_modul-every_8-grid_1"
+    assert display_name(model, "nano") == "nano"
+    assert display_name(f"{model}{ARM}drop:all", "nano") == f"nano{ARM}drop:all"
+    assert display_name(model, 60000) == model
 
 
 def record(**changes: Any) -> EpisodeRecord:
