@@ -229,7 +229,7 @@ def test_the_command_serves_and_stops_on_request(tmp_path):
             server.terminate()
             done = commands.finish(server)
         assert done.returncode == 0
-        assert "stopped · 0 clients · 1 inferences" in done.stderr
+        assert "stopped · 0 clients · 1 inference " in done.stderr
     finally:
         server.kill()
 

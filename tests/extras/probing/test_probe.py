@@ -262,7 +262,7 @@ def test_settings_of_recordings_and_rollouts_are_keywords(tmp_path: Path) -> Non
 
 
 def test_names_of_a_checkpoints_plugins_are_checked_once_the_plugins_are_imported() -> None:
-    words = ["checkpoint=run", "recordings=data", "with=[hesitate:8]"]
+    words = ["checkpoint=run", "recordings=sample", "with=[hesitate:8]"]
     trusting = policy_config(compose("probe", [*words, "trust_plugins=true"]))
     ProbeChoice.from_config(trusting).check()
     with pytest.raises(UserError, match="name='hesitate'"):

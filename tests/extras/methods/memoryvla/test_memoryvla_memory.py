@@ -244,5 +244,5 @@ def test_it_starts_from_a_policy_with_banks_whose_banks_stay_behind(tmp_path: Pa
         assert all("_bank" in name for name in took.left) and took.left
         assert {policy.finetune_spec.component_of(name) for name in took.new} == {"memory"}
         assert torch.equal(policy.core.head.output.bias, banked.core.head.output.bias)  # type: ignore[union-attr]
-    with pytest.raises(UserError, match="no name in this format"):
+    with pytest.raises(UserError, match="This format has no name"):
         write_policy(policy, tmp_path / "theirs", "memoryvla", torch.float32, None)

@@ -116,5 +116,5 @@ def test_what_the_format_has_no_name_for_is_refused(tmp_path: Path) -> None:
     apply_finetuning(lora_targets, "lora", freeze_vision=False, rank=2)
     for policy in (built("openvla_oft_framesamp_context"), lora_targets):
         (folder := tmp_path / policy.config["name"]).mkdir(exist_ok=True)
-        with pytest.raises(UserError, match="no name in this format"):
+        with pytest.raises(UserError, match="This format has no name"):
             write_policy(policy, folder, "openvla", torch.float32, None)
