@@ -173,24 +173,16 @@ class FlowHead:
         """
         return predict
 
-    def step(
-        self,
-        x: Tensor,
-        velocity: Tensor,
-        steps: int,
-        increment: Tensor | None = None,
-        deviation: float | None = None,
-    ) -> Tensor:
-        """One Euler step of x [b, h, a]: x − v/steps, and with Gaussian noise + σ·ε.
+    def step(self, x: Tensor, velocity: Tensor, steps: int, noise: Tensor | None = None) -> Tensor:
+        """One Euler step of states x [b, h, a]: x − v/k, and σ·ε where there is `noise`.
 
         Args:
-            increment: ε [b, h, a], standard normal; None for none.
-            deviation: σ; the head's own by default.
+            velocity: v [b, h, a] at x.
+            steps: k, of the whole way.
+            noise: σ·ε [b, h, a].
         """
         x = x - velocity.to(x.dtype) / steps
-        if increment is not None:
-            x = x + (self.deviation if deviation is None else deviation) * increment
-        return x
+        return x if noise is None else x + noise
 
     # Gaussian steps, whose density is known
 
@@ -210,9 +202,9 @@ class FlowHead:
         velocity = self.velocity(predict, times, {"noise": noise})
         states = [noise]
         for index, increment in enumerate(increments.unbind(1)):
-            noisy = increment if deviation else None
             v = velocity(states[-1], index)
-            states.append(self.step(states[-1], v, steps, noisy, deviation))
+            scaled = deviation * increment if deviation else None
+            states.append(self.step(states[-1], v, steps, scaled))
         return torch.stack(states, 1)
 
     def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:

@@ -247,8 +247,8 @@ class Pi05Backbone(
         # Euler steps from noise to actions.
         increments = noise.get("increments")
         for index in range(len(times)):
-            increment = None if increments is None else increments[:, index]
-            x = self.head.step(x, velocity(x, index), len(times), increment)
+            scaled = None if increments is None else self.head.deviation * increments[:, index]
+            x = self.head.step(x, velocity(x, index), len(times), scaled)
         return x
 
     def conditions(self, steps: int) -> Conditioning:

@@ -443,8 +443,8 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
             velocity = rtc_guidance(velocity, batch.overlap, times)
         increments = noise.get("increments")
         for index in range(len(times)):
-            increment = None if increments is None else increments[:, index]
-            x = self.head.step(x, velocity(x, index), len(times), increment)
+            scaled = None if increments is None else self.head.deviation * increments[:, index]
+            x = self.head.step(x, velocity(x, index), len(times), scaled)
         return x
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
