@@ -41,7 +41,7 @@ from mme_vla.extras.nano.evaluating import (
 from mme_vla.extras.nano.fitting import Training, compose_policy, train_in_process
 from mme_vla.extras.nano.learning import check_reflection
 from mme_vla.extras.nano.page import ends_of, outcome_lines, write_page
-from mme_vla.extras.nano.settings import STAGES, NanoRun, check_episodes
+from mme_vla.extras.nano.settings import STAGES, NanoRun
 from mme_vla.extras.nano.tokens import TokenStore
 from mme_vla.utils import read_json, write_json
 
@@ -58,7 +58,6 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
     """
     until = STAGES.index(nano.stage)
     folder = Path(nano.output)
-    check_episodes(nano)
     choose_shard(nano.shard)  # read here, before hours of recording and training
     rows = compose_rows(nano, extra_dirs)
     folder.mkdir(parents=True, exist_ok=True)

@@ -78,7 +78,22 @@ class NanoRun:
         """Read a composed configuration, plain and resolved."""
         run = read_section(cls, config, others=True, config={})
         read_section(LearningSettings, config["learning"], "learning")
+        run._check_episodes()
         return replace(run, train=config["train"], learning=config["learning"], config=config)
+
+    def _check_episodes(self) -> None:
+        """Make sure that the episodes exist: they are chosen only after hours of recording and
+        training.
+        """
+        amounts = [self.episodes]
+        if self.also and self.also_episodes is not None:
+            amounts.append(self.also_episodes)
+        for episodes in amounts:
+            require(
+                isinstance(episodes, int) or not self.replace,
+                f"episodes={episodes}: with replace=true write how many scenes of each task.",
+            )
+            choose_episodes(self.task, episodes, self.split)
 
     @property
     def budgets(self) -> tuple[int | None, ...]:
@@ -94,18 +109,3 @@ class NanoRun:
     def is_further(self, row: str) -> bool:
         """Whether a row is one of `also`, which have fewer trainings and episodes."""
         return row.partition("@")[0] in self.also
-
-
-def check_episodes(nano: NanoRun) -> None:
-    """Make sure, without PyTorch, that the episodes exist: they are chosen only after hours of
-    recording and training.
-    """
-    amounts = [nano.episodes]
-    if nano.also and nano.also_episodes is not None:
-        amounts.append(nano.also_episodes)
-    for episodes in amounts:
-        require(
-            isinstance(episodes, int) or not nano.replace,
-            f"episodes={episodes}: with replace=true write how many scenes of each task.",
-        )
-        choose_episodes(nano.task, episodes, nano.split)

@@ -81,10 +81,9 @@ def _as_lists(words: Sequence[str]) -> list[str]:
 
 def command(cfg: DictConfig) -> None:
     """Record, train, evaluate and write the page; what exists is skipped."""
-    from mme_vla.extras.nano.settings import NanoRun, check_episodes
+    from mme_vla.extras.nano.settings import NanoRun
 
     nano = NanoRun.from_config(resolved(cfg))
-    check_episodes(nano)
     trees = command_trees()[1:]
     for model in nano.models:
         if model not in yaml_files([*library_trees(), *trees], "model"):
