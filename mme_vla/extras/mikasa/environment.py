@@ -20,7 +20,7 @@ from mme_vla.errors import check_known
 from mme_vla.extras.mikasa.assets import check_assets, check_package, is_there
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS, by_horizon, by_memory
 from mme_vla.extras.mikasa.demonstrators import demonstrate, place_of
-from mme_vla.extras.mikasa.facts import kind_of
+from mme_vla.extras.mikasa.facts import facts_of_task
 from mme_vla.registry import ENVS
 
 CAMERAS = {"top": "base_camera", "wrist": "hand_camera"}
@@ -39,7 +39,7 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         time: steps since the reset.
         frozen: first steps in which no action has an effect.
         cue_end: the first step at which the answer can be given.
-        known: what its frames show.
+        scene_facts: what its frames show.
         log: the facts of those so far.
     """
 
@@ -77,12 +77,12 @@ class MikasaScene(gymnasium.Env[Any, Any]):
             if hasattr(self.scene, name):
                 self.cue_end += int(getattr(self.scene, name)[0])
         self.frozen = self.cue_end if self._freezes else 0
-        self.known = kind_of(self._task)(self.scene, self.cue_end)
+        self.scene_facts = facts_of_task(self._task)(self.scene, self.cue_end)
         if self._is_twin:
-            self.known.flip()
+            self.scene_facts.flip()
             self.scene.get_info()  # which places what is shown
         self.log = FactLog()
-        self.log.add(*self.known.look(0))
+        self.log.add(*self.scene_facts.visible_facts(0))
         goal = info["language_instruction"]
         if not isinstance(goal, str):
             goal = goal[0]
@@ -95,7 +95,7 @@ class MikasaScene(gymnasium.Env[Any, Any]):
             action = np.zeros_like(action)
         _, reward, terminated, truncated, info = self._env.step(action)
         self.time += 1
-        self.log.add(*self.known.look(self.time))
+        self.log.add(*self.scene_facts.visible_facts(self.time))
         success = bool(info["success"])
         return (
             self.observe(),
@@ -204,10 +204,10 @@ class Mikasa(Environment):
 
     def twin(self, spec: EpisodeSpec) -> Mapping[str, Any] | None:
         """The scene flips its fact itself."""
-        return {"flipped": True} if kind_of(spec.task).has_twin else None
+        return {"flipped": True} if facts_of_task(spec.task).has_twin else None
 
     def candidates(self, env: MikasaScene) -> Candidates | None:
-        return env.known.candidates(env.time)
+        return env.scene_facts.candidates(env.time)
 
     def tool(self, env: MikasaScene) -> Sequence[float]:
         """X and y of the hand, in metres."""

@@ -1,7 +1,7 @@
 """What the tasks of MIKASA-Robo-VLA show and need later, from the simulator's state: one class for
 each kind of scene, its facts and the fact that a twin flips.
 
-Tasks whose models the package lacks have none: `Known`.
+Tasks whose models the package lacks have none: `SceneFacts`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ _COLUMN = 0.1  # metres between the three columns in which TakeItBack's cube beg
 _COLUMNS = ("right", "middle", "left")
 
 
-class Known:
+class SceneFacts:
     """What the frames of a scene show. This one shows nothing that is needed later.
 
     Args:
@@ -33,7 +33,7 @@ class Known:
         self._scene = scene
         self._cue_end = cue_end
 
-    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         """What the next frame shows, and whether a decision begins there that depends on the facts.
 
         time: steps since the reset.
@@ -48,7 +48,7 @@ class Known:
         return None
 
 
-class Recall(Known):
+class Recall(SceneFacts):
     """Remember: one object is shown. FindImposter: all but one are shown, and that one is right.
     All are on the table when the answer can be given.
     """
@@ -93,7 +93,7 @@ class Recall(Known):
             return self._answers
         return [key for key in self._things if key not in self._answers]
 
-    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         visible = {}
         for number, key in enumerate(self._shown(time), 1):
             visible[f"object {number}"] = VisibleFact(self._name(key))
@@ -131,7 +131,7 @@ class Several(Recall):
         super().__init__(scene, cue_end)
         self._touched: list[int] = []
 
-    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         scene = self._scene
         shown = list(self._shown(time))
         duration = getattr(scene, "cue_step_duration_per_env", None)
@@ -186,7 +186,7 @@ class InOrder(Several):
         return Recall.candidates(self, time) if self._is_lifted(time) else None
 
 
-class Origin(Known):
+class Origin(SceneFacts):
     """TakeItBack: where the cube lay. Twins begin in another of the three columns."""
 
     has_twin = True
@@ -196,7 +196,7 @@ class Origin(Known):
         """Of the three columns, 0 to 2, that in which the cube began."""
         return int(np.floor(place_of(self._scene.initial_region)[1] / _COLUMN + 0.25)) + 1
 
-    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         scene = self._scene
         gap = place_of(scene.cube) - place_of(scene.initial_region)
         reached = bool(scene.goal_reached_status[0])
@@ -224,12 +224,12 @@ class Origin(Known):
         return Candidates(places, [column])
 
 
-class Turned(Known):
+class Turned(SceneFacts):
     """Rotate: how the peg lay, from which it is to be turned by an angle that the goal names."""
 
     _is_turned = False
 
-    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         scene = self._scene
         turned = abs(wrapped(float(scene.target_angle[0]) - float(scene.angle_diff[0]))) > _MOVED
         decides = turned and not self._is_turned
@@ -240,12 +240,12 @@ class Turned(Known):
         return {"angle": VisibleFact(f"{degrees:.0f} degrees")}, decides
 
 
-class Rolling(Known):
+class Rolling(SceneFacts):
     """Intercept: the ball's velocity, which two frames show. It stays in view, so that no decision
     depends on a fact that is gone.
     """
 
-    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         ball = self._scene.ball
         if np.linalg.norm(place_of(ball) - place_of(self._scene.agent.tcp)) < _NEAR:
             return {}, False
@@ -253,7 +253,7 @@ class Rolling(Known):
         return {"velocity": VisibleFact(f"{speed:.2f} m/s")}, False
 
 
-_KINDS: Mapping[str, type[Known]] = {
+_KINDS: Mapping[str, type[SceneFacts]] = {
     "Remember": Recall,
     "FindImposter": Recall,
     "BunchOfColors": Several,
@@ -266,9 +266,9 @@ _KINDS: Mapping[str, type[Known]] = {
 """Beginning of a task's name → what its scenes show."""
 
 
-def kind_of(task: str) -> type[Known]:
+def facts_of_task(task: str) -> type[SceneFacts]:
     """The class that knows what the scenes of a task show."""
     for beginning, kind in _KINDS.items():
         if task.startswith(beginning):
             return kind
-    return Known
+    return SceneFacts

@@ -12,7 +12,7 @@ from mme_vla.envs import base
 from mme_vla.envs.base import environment
 from mme_vla.envs.facts import FactLog
 from mme_vla.extras.mikasa.catalog import FAMILY_OF
-from mme_vla.extras.mikasa.facts import InOrder, Several, kind_of
+from mme_vla.extras.mikasa.facts import InOrder, Several, facts_of_task
 from mme_vla.extras.probing.evidence import record_evidence
 from mme_vla.extras.probing.writing import operations_of
 
@@ -45,7 +45,7 @@ def played(known: Several, scene: Any, touches: dict[int, int], steps: int = 30)
             if begun <= time < begun + 2:
                 scene.agent.tcp = scene.cubes[key]
                 scene.touched_cubes[0, key] = True
-        log.add(*known.look(time))
+        log.add(*known.visible_facts(time))
     return log
 
 
@@ -104,7 +104,7 @@ def test_twins_of_a_chain_exchange_the_first_two_and_decide_at_once() -> None:
 
 
 def test_tasks_whose_answer_is_an_object_have_twins() -> None:
-    with_twin = [task for task in FAMILY_OF if kind_of(task).has_twin]
+    with_twin = [task for task in FAMILY_OF if facts_of_task(task).has_twin]
     kinds = {FAMILY_OF[task].memory for task in with_twin}
     assert len(with_twin) == 46 and kinds == {
         "Object", "Negative", "Spatial", "Capacity", "Sequential"
