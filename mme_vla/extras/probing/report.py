@@ -109,11 +109,12 @@ def phases_table(findings: Findings) -> Table | None:
     return Table("By task and sub-task", ("task and sub-task", *arms), rows)
 
 
-CUBE_COLOURS = {"red", "blue", "green"}
+MOST_WORDS = 3
+"""Different words of a sub-task's texts that are named; of more there is an ellipsis."""
 
 
 def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
-    """The name of a sub-task: its number, and the words that its texts share."""
+    """The name of a sub-task: its number, and the words of its texts."""
     name = f"sub-task {phase + 1}"
     if task:
         name = f"{task}, {name}"
@@ -125,9 +126,8 @@ def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
         return f"{name}: {texts[0]}" if len(texts) == 1 else f"{name}: {_common_start(words)}"
     shared: list[str] = []
     for column in zip(*words, strict=True):
-        word = column[0] if len(set(column)) == 1 else "…"
-        if word == "…" and CUBE_COLOURS.issuperset(column):
-            word = "named"  # by the goal: the text is whole without its colour
+        different = sorted(set(column))
+        word = "/".join(different) if len(different) <= MOST_WORDS else "…"
         if word != "…" or shared[-1:] != ["…"]:
             shared.append(word)
     return f"{name}: {' '.join(shared)}"

@@ -171,14 +171,17 @@ def test_sub_tasks_are_called_by_the_words_that_their_texts_share() -> None:
     texts = ["pick up the red cube", "pick up the blue cube"]
     lines = [replace(LINE, subgoal=text) for text in texts]
     assert phase_name("VideoUnmask", 0, lines) == (
-        "VideoUnmask, sub-task 1: pick up the named cube"
+        "VideoUnmask, sub-task 1: pick up the blue/red cube"
     )
     longer = replace(LINE, subgoal="pick up the cube and wait")
     assert phase_name("VideoUnmask", 1, [*lines, longer]) == (
         "VideoUnmask, sub-task 2: pick up the …"
     )
     seconds = [replace(LINE, subgoal=f"pick it up for the {word} time") for word in ("1st", "2nd")]
-    assert phase_name("", 2, seconds) == "sub-task 3: pick it up for the … time"
+    assert phase_name("", 2, seconds) == "sub-task 3: pick it up for the 1st/2nd time"
+    words = ("1st", "2nd", "3rd", "4th")
+    many = [replace(LINE, subgoal=f"pick it up for the {word} time") for word in words]
+    assert phase_name("", 2, many) == "sub-task 3: pick it up for the … time"
     assert phase_name("", 2, [LINE]) == "sub-task 3"
     assert phases_table(Findings(lines, [])) is None, "all decisions are of one sub-task"
     both = phases_table(Findings([LINE, replace(LINE, phase=1)], []))
