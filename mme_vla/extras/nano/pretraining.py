@@ -22,7 +22,7 @@ from mme_vla.envs.grounding import project
 from mme_vla.envs.observations import INTRINSIC, front_extrinsic
 from mme_vla.errors import require
 from mme_vla.extras.nano.tower import CLASSES, FLOOR, PlaceTower, TowerConfig
-from mme_vla.processing.images import to_unit_range
+from mme_vla.types import to_unit_range
 from mme_vla.utils import write_atomically
 from mme_vla.weights.torch_files import load_torch_file
 

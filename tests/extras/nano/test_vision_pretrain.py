@@ -37,7 +37,7 @@ from mme_vla.extras.nano.pretraining import (
 )
 from mme_vla.extras.nano.scenes import Place, visible_places
 from mme_vla.extras.nano.tower import CLASSES, TowerConfig
-from mme_vla.processing.images import to_unit_range
+from mme_vla.types import to_unit_range
 
 RED, BUTTON = CLASSES.index("red cube"), CLASSES.index("button")
 TINY = TowerConfig(32, 8, 8, 8, layout="places", pretrained=False)

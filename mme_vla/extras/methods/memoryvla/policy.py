@@ -36,11 +36,10 @@ from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import PolicyProcessor
-from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
 from mme_vla.speed import Recompute, compile_parts
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import MemoryTokens, Noise, map_noise
+from mme_vla.types import MemoryTokens, Noise, map_noise, to_unit_range
 
 
 @POLICIES.register("memoryvla")

@@ -17,9 +17,8 @@ from mme_vla.extras.methods.openvla_oft.processor import (
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.network import MemoryTower
-from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
-from mme_vla.types import Batch
+from mme_vla.types import Batch, to_unit_range
 
 
 @POLICIES.register("openvla")

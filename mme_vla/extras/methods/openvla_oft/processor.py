@@ -15,10 +15,10 @@ from torch import Tensor
 from mme_vla.config.sections import without
 from mme_vla.errors import brief, require
 from mme_vla.processing.base import Sample, SampleSpec, StatsSpec
-from mme_vla.processing.images import as_uint8_frames, hsv_to_rgb, rgb_to_hsv, to_unit_range
+from mme_vla.processing.images import as_uint8_frames, hsv_to_rgb, rgb_to_hsv
 from mme_vla.processing.processor import Processor
 from mme_vla.registry import PROCESSORS
-from mme_vla.types import Batch
+from mme_vla.types import Batch, to_unit_range
 
 EPSILON = 1e-8
 

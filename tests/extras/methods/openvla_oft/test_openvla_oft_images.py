@@ -16,7 +16,7 @@ from mme_vla import UserError
 from mme_vla.extras.methods.openvla_oft import processor as image_ops
 from mme_vla.extras.methods.openvla_oft.processor import ClippedQuantiles
 from mme_vla.extras.methods.prismatic import HALF, OPENVLA
-from mme_vla.processing.images import to_unit_range
+from mme_vla.types import to_unit_range
 
 FLOAT, ONE_LEVEL = 1e-5, 1e-3  # of the largest entry; share of values that may be off by one level
 
