@@ -275,13 +275,16 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             recorded=recorded,
         )
 
-    def past_actions(self, step: Step, frames: FrameMap | None = None) -> np.ndarray:
+    def past_actions(self, step: Step, frames: FrameMap) -> np.ndarray:
         """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and
         there are.
+
+        frames: how the step's episode is shown.
         """
         source = self.sources[step.source]
         most = self.processor.prompt_spec.past_actions
-        if frames is None or source.robot.action.frames is None:
+        # Transforms repeat and leave out frames; a motion of many frames stays one action.
+        if source.robot.action.frames is None:
             return source.past_actions(step.episode, step.index, most, self.action_offset)
         now = int(frames.transformed(np.array(step.index)))
         rows = frames.real[max(frames.exec_start, now - most) : now] + self.action_offset
@@ -301,9 +304,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def _item(self, index: int, transforms: Sequence[Perturbation]) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        frames = self._frame_map(
-            step.source, step.episode, np.array([step.index]), index, transforms
-        )
+        decision = np.array([step.index])
+        frames = self._frame_map(step.source, step.episode, decision, index, transforms)
         return self.inputs_at(step, rng, frames) | {
             "goal": step.goal,
             "subgoals": step.subgoals,
@@ -317,27 +319,19 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         frames: np.ndarray,
         index: int,
         transforms: Sequence[Perturbation],
-    ) -> FrameMap | None:
-        """How transforms show an item's episode up to the last of its `frames`; None without
-        transforms.
-        """
-        if not transforms:
-            return None
+    ) -> FrameMap:
+        """How transforms show an item's episode up to the last of its `frames`."""
         rng = np.random.default_rng([self.seed, self.epoch, index, TRANSFORMS])
         exec_start = int(self.sources[source].exec_starts[episode])
         return map_frames(transforms, int(frames[-1]) + 1, exec_start, rng, keep=frames)
 
-    def inputs_at(
-        self, step: Step, rng: np.random.Generator, frames: FrameMap | None = None
-    ) -> dict[str, Any]:
+    def inputs_at(self, step: Step, rng: np.random.Generator, frames: FrameMap) -> dict[str, Any]:
         """What the network reads and learns of a step, with what its memory selects: its `history`
         and `past`.
 
-        frames: the map of a transformed episode; all that is read of the past goes through it.
+        frames: how the step's episode is shown; all that is read of the past goes through it.
         """
-        now, real = step.index, None
-        if frames is not None:
-            now, real = int(frames.transformed(np.array(step.index))), frames.real
+        now = int(frames.transformed(np.array(step.index)))
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
         item = self.processor.item(self._sample(step, subgoal, now, frames))
         if self.mask_padding:
@@ -349,10 +343,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             if self.memory.uses_proprio:
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
-            if frames is not None:
+            if frames.transforms:
                 history = TransformedHistory(history, frames)
             selection = self.memory.gather_selection(history, now, rng if self.jitter else None)
-            item["history"] = with_labels(selection, columns.of_memory(step.episode), real)
+            item["history"] = with_labels(selection, columns.of_memory(step.episode), frames.real)
             spec = self.memory.past_view_spec
             if spec is not None:
                 read = partial(self._images, step.source, step.episode, frames)
@@ -360,11 +354,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         return item
 
     def _images(
-        self, source: int, episode: int, frame_map: FrameMap | None, frames: np.ndarray
+        self, source: int, episode: int, shown: FrameMap, frames: np.ndarray
     ) -> list[np.ndarray]:
-        if frame_map is not None:
-            frames = frame_map.real[frames]
-        return [self.sources[source].frames(episode, frames, name) for name in self._cameras]
+        recorded = shown.real[frames]
+        return [self.sources[source].frames(episode, recorded, name) for name in self._cameras]
 
     @property
     def _cameras(self) -> Sequence[str]:
@@ -375,24 +368,18 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             self.processor, *self.sources[source].robot_motion(episode, frames, self.action_offset)
         )
 
-    def _sample(self, step: Step, subgoal: str | None, now: int, frames: FrameMap | None) -> Sample:
+    def _sample(self, step: Step, subgoal: str | None, now: int, frames: FrameMap) -> Sample:
         """A step with the frames of its window; before the first frame of the execution that one is
         repeated.
         """
         source = self.sources[step.source]
         samples = self.processor.samples
         # The recorded frames of the window, and of the history that the memory camera shows.
-        start = step.exec_start
-        if frames is not None:
-            start = frames.exec_start
-        window = np.arange(now - samples.window + 1, now + 1).clip(min=min(start, now))
+        shown = np.arange(now - samples.window + 1, now + 1).clip(min=min(frames.exec_start, now))
+        window = frames.real[shown]
         past = None
         if samples.history is not None:
-            past = samples.history(now)
-        if frames is not None:
-            window = frames.real[window]
-            if past is not None:
-                past = frames.real[past]
+            past = frames.real[samples.history(now)]
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
         views = {}
@@ -459,7 +446,7 @@ class GroupDataset(TrainingDataset):
         stride = self.processor.embodiment.action.execute
         frames = np.arange(frame, -1, -stride)[: self.processor.samples.group_size][::-1]
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        return self._group(s, episode, frames, rng)
+        return self._group(s, episode, frames, rng, self._frame_map(s, episode, frames, index, ()))
 
     def _group(
         self,
@@ -467,13 +454,12 @@ class GroupDataset(TrainingDataset):
         episode: int,
         frames: np.ndarray,
         rng: np.random.Generator,
-        frame_map: FrameMap | None = None,
+        frame_map: FrameMap,
     ) -> dict[str, Any]:
         steps = [self.step_at(s, episode, int(frame)) for frame in frames]
-        times = frames if frame_map is None else frame_map.transformed(frames)
         return {
             "moments": [self.inputs_at(step, rng, frame_map) for step in steps],
-            "times": times.astype(np.int64),
+            "times": frame_map.transformed(frames).astype(np.int64),
             "goal": steps[-1].goal,
             "subgoals": steps[-1].subgoals,
             "place": (s, episode, int(frames[-1])),

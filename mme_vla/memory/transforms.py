@@ -18,7 +18,9 @@ from mme_vla.memory.perturbation import Perturbation
 
 @dataclass(frozen=True)
 class FrameMap:
-    """The one map from the frames of a transformed episode to those that were recorded.
+    """The one map from the frames of an episode as it is shown to those that were recorded.
+
+    Without transforms each frame is itself.
 
     real: int64 [n], ascending; the recorded frame of each transformed one, up to the current one.
     exec_start: the first transformed frame of the execution.

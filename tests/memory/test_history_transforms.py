@@ -185,7 +185,8 @@ def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.Monkey
     past = data.past_actions(step, visible)
     repeated = sources[0].actions(step.episode, step.index - 1, step.index)
     assert np.array_equal(past, np.repeat(repeated, 4, 0))
-    assert len(data.past_actions(step)) == 4 and not np.array_equal(data.past_actions(step), past)
+    recorded = data.past_actions(step, map_frames((), step.index + 1, exec_start))
+    assert len(recorded) == 4 and not np.array_equal(recorded, past)
 
 
 def test_the_times_of_a_group_are_transformed(sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:

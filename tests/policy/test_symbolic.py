@@ -9,6 +9,7 @@ import pytest
 from mme_vla import UserError, build_policy
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.memory.transforms import map_frames
 from mme_vla.processing.prompt import POINT, SubgoalText, perturb_point
 from mme_vla.testing.small import moving_frames, small_policy
 
@@ -101,20 +102,17 @@ def test_past_actions_of_training_are_the_ones_right_before_the_chunk(source):
     policy.processor.stats = small_policy("pi05").processor.stats
     data = TrainingDataset([source], policy.processor)
     start = int(source.exec_starts[0])
-    assert data.past_actions(data.step(0)).shape == (0, 8), (
-        "the video's actions are not the robot's own"
-    )
-    assert np.array_equal(data.past_actions(data.step(3)), source.actions(0, start, start + 3))
-    assert np.array_equal(
-        data.past_actions(data.step(40)), source.actions(0, start + 24, start + 40)
-    )
+
+    def past(data: TrainingDataset, index: int) -> np.ndarray:
+        step = data.step(index)
+        return data.past_actions(step, map_frames((), step.index + 1, step.exec_start))
+
+    assert past(data, 0).shape == (0, 8), "the video's actions are not the robot's own"
+    assert np.array_equal(past(data, 3), source.actions(0, start, start + 3))
+    assert np.array_equal(past(data, 40), source.actions(0, start + 24, start + 40))
     later = TrainingDataset([source], policy.processor, action_offset=1)
-    assert later.past_actions(later.step(0)).shape == (0, 8), (
-        "no action comes before the first frame of the execution"
-    )
-    assert np.array_equal(
-        later.past_actions(later.step(3)), source.actions(0, start + 1, start + 4)
-    )
+    assert past(later, 0).shape == (0, 8), "no action comes before the first frame of the execution"
+    assert np.array_equal(past(later, 3), source.actions(0, start + 1, start + 4))
     assert int(data[40]["prompt_mask"].sum()) < 640, "all 128 numbers fit"
     assert len(re.findall(r"\d+", words(policy, data[40]).split("Past actions:")[1])) == 128
 
