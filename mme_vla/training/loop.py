@@ -114,47 +114,12 @@ class Trainer:
             accelerator.process_index,
             accelerator.num_processes,
         )
-        workers = settings.workers
-        ahead = None
-        if workers:
-            rows = self.order.rows(0)
-            batch_bytes = size_of(samples[0]) * (rows.stop - rows.start)
-            workers, ahead = readers(workers, batch_bytes, settings.prefetch_gb * 1e9)
-        self.loader = DataLoader(
-            _InEpoch(samples),
-            batch_sampler=self.order,
-            collate_fn=collate,
-            num_workers=workers,
-            prefetch_factor=ahead,
-            pin_memory=accelerator.device.type == "cuda",
-            worker_init_fn=leave_signals_alone,
-            generator=generator_for(settings.seed, "workers"),
-        )
+        self.loader = self._loader(samples, collate)
         self.sharded = settings.parallel.shards(accelerator.device)
         if not self.sharded:
             policy.to(accelerator.device)
         self.policy = policy.train()
-        if settings.losses:
-            if policy.loss_weights is None:
-                raise UserError(
-                    f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out."
-                )
-            policy.loss_weights = dict(settings.losses)
-        if settings.recomputation:
-            if not isinstance(policy, Recomputes):
-                raise UserError(
-                    f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute"
-                    " activations; set it to false."
-                )
-            policy.recompute(settings.recomputation)
-        if settings.compile:
-            missing = missing_compiler(accelerator.device)
-            if missing is not None:
-                raise UserError(
-                    f"train.compile=true needs {missing}: install it, or set train.compile=false."
-                )
-            keep_compiled_code()
-            policy.compile()
+        _prepare(policy, settings, accelerator.device)
         if self.sharded:
             mesh = settings.parallel.mesh(accelerator.device.type)
             shard(policy, mesh, policy.compute_dtype, settings.compile)
@@ -164,7 +129,8 @@ class Trainer:
         self.ema = EMA(parameters, settings.ema, settings.ema_warmup, partial(reshard, policy))
         if run.checkpoint is not None:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
-        self.model = policy if self.sharded else accelerator.prepare_model(policy)
+        # What an update calls: sharded weights exchange gradients themselves, others through DDP.
+        self._replicated = policy if self.sharded else accelerator.prepare_model(policy)
         self._parameters = list(parameters.values())
         # What a CPU takes for it was not measured.
         on_gpu = accelerator.device.type == "cuda"
@@ -179,6 +145,25 @@ class Trainer:
         """Why the last checkpoint has no self-check although it should."""
         self.stopped_by: int | None = None
         """The signal that ended `run` early."""
+
+    def _loader(self, samples: Samples, collate: Collate) -> DataLoader[Any]:
+        settings = self.settings
+        workers = settings.workers
+        ahead = None
+        if workers:
+            rows = self.order.rows(0)
+            batch_bytes = size_of(samples[0]) * (rows.stop - rows.start)
+            workers, ahead = readers(workers, batch_bytes, settings.prefetch_gb * 1e9)
+        return DataLoader(
+            _InEpoch(samples),
+            batch_sampler=self.order,
+            collate_fn=collate,
+            num_workers=workers,
+            prefetch_factor=ahead,
+            pin_memory=self.accelerator.device.type == "cuda",
+            worker_init_fn=leave_signals_alone,
+            generator=generator_for(settings.seed, "workers"),
+        )
 
     def describe(self) -> str:
         """What is trained, where, in one line."""
@@ -263,7 +248,7 @@ class Trainer:
             piece_draws = {name: send(value[rows], device) for name, value in draws.items()}
             is_last = piece == settings.accumulate - 1
             with self._gradients_shared(is_last):
-                loss, metrics = self.model(batch, piece_draws)
+                loss, metrics = self._replicated(batch, piece_draws)
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
@@ -279,7 +264,7 @@ class Trainer:
             self.policy.set_requires_gradient_sync(shared)  # type: ignore[operator]
             yield
         else:
-            with nullcontext() if shared else self.accelerator.no_sync(self.model):
+            with nullcontext() if shared else self.accelerator.no_sync(self._replicated):
                 yield
 
     def validate(self, step: int, line: ProgressLine, loggers: Loggers) -> float | None:
@@ -365,6 +350,35 @@ class Trainer:
             values["memory/gib"] = resident_gib()
         loggers.write(step, values)
         line.numbers(step, values)
+
+
+def _prepare(policy: Policy, settings: TrainSettings, device: torch.device) -> None:
+    """Set what the settings ask of a policy: auxiliary losses, recomputation, compilation.
+
+    Raises:
+        UserError: the policy, or this machine, has no such thing.
+    """
+    if settings.losses:
+        if policy.loss_weights is None:
+            raise UserError(
+                f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out."
+            )
+        policy.loss_weights = dict(settings.losses)
+    if settings.recomputation:
+        if not isinstance(policy, Recomputes):
+            raise UserError(
+                f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute"
+                " activations; set it to false."
+            )
+        policy.recompute(settings.recomputation)
+    if settings.compile:
+        missing = missing_compiler(device)
+        if missing is not None:
+            raise UserError(
+                f"train.compile=true needs {missing}: install it, or set train.compile=false."
+            )
+        keep_compiled_code()
+        policy.compile()
 
 
 @contextmanager
