@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.data.episode_table import Description
 from mme_vla.data.image_consistency import (
     CORRECT,
     HALF,
@@ -27,7 +28,6 @@ from mme_vla.data.lerobot_files import (
     REMEDY,
     SIDE_FILE,
     TASKS,
-    Description,
     read_records,
     read_tasks,
 )

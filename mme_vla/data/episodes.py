@@ -20,6 +20,7 @@ from mme_vla.data.consistency import (
     compare_stats,
     compare_units,
 )
+from mme_vla.data.episode_table import Description, read_episode_table
 from mme_vla.data.frame_tables import check_vectors, flat, open_table, read_index_columns
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.image_consistency import check_mode
@@ -29,11 +30,9 @@ from mme_vla.data.lerobot_files import (
     SAMPLE,
     SIDE_FILE,
     TASKS,
-    Description,
     content_fingerprint,
     find_columns,
     names_of,
-    read_episode_table,
     read_exec_starts,
     read_info,
     read_records,
@@ -130,11 +129,7 @@ class EpisodeSource:
         self.video_cameras = tuple(videos)
         video_columns = tuple(dict.fromkeys(videos.values()))
 
-        # Checksums of what every opening reads anyway; tables that hold images are left to
-        # `verify`.
-        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
-        opened = ("meta/",) if images else ("meta/", "data/")
-        sums.check(*(name for name in sums.table if name.startswith(opened)))
+        self._check_sums(("meta/",) if images else ("meta/", "data/"))
 
         # Episodes and rows.
         self._episodes = read_episode_table(self.root, video_columns)
@@ -160,8 +155,20 @@ class EpisodeSource:
             if column in rows:
                 self._rendered[camera] = rows[column].astype(bool)
 
-        # The greatest sizes of numbers, and whether they fit their units.
-        self.scales: dict[str, np.ndarray] = {}
+        self.scales = self._read_scales()
+        action = self.robot.action
+        compare_units(self.root, action.names, action.units, self.scales["action"])
+
+    def _check_sums(self, opened: tuple[str, ...]) -> None:
+        """Check what every opening reads anyway, by the beginnings of names. Tables that hold
+        images are left to `verify`.
+        """
+        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
+        sums.check(*(name for name in sums.table if name.startswith(opened)))
+
+    def _read_scales(self) -> dict[str, np.ndarray]:
+        """Check all vectors against their statistics; returns the greatest size of each number."""
+        scales: dict[str, np.ndarray] = {}
         for kind, vectors in self._vectors_of.items():
             sizes = []
             for column, width in vectors.items():
@@ -169,9 +176,8 @@ class EpisodeSource:
                 compare_stats(self.root, column, least, greatest)
                 sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
             if sizes:
-                self.scales[kind] = np.concatenate(sizes)
-        action = self.robot.action
-        compare_units(self.root, action.names, action.units, self.scales["action"])
+                scales[kind] = np.concatenate(sizes)
+        return scales
 
     def __len__(self) -> int:
         return len(self.lengths)

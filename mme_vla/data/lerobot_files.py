@@ -21,7 +21,7 @@ from pydantic import BaseModel, Field
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
-from mme_vla.errors import UserError, brief, counted, listed, require
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import decoding, inside, read_json, require_file
 from mme_vla.utils.validation import validated
 
@@ -149,56 +149,17 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     Raises:
         UserError: a column is missing, or holds something else than the robot has.
     """
-    spellings: dict[str, list[str]] = {}
-    for camera in robot.cameras:
-        spellings[camera.name] = []
-        for name in (camera.key or camera.name, camera.name):
-            spellings[camera.name] += [name, f"observation.images.{name}"]
-    for key in (*robot.state.key, *robot.action.pose_key):
-        spellings[key] = [key, f"observation.{key}"]
-    for key in robot.action.key:
-        spellings[key] = [key]
-        if key in _ACTION:
-            spellings[key] += _ACTION
-    if not robot.state.key:
-        spellings["state"] = ["observation.state", "state"]
-    if not robot.action.key:
-        spellings["action"] = [*_ACTION]
-
     columns: dict[str, str] = {}
     missing = []
-    for name, candidates in spellings.items():
+    for name, candidates in _spellings(robot).items():
         column = next((candidate for candidate in candidates if candidate in features), None)
         if column is None:
             missing.append(candidates[0])
         else:
             columns[name] = column
     if missing:
-        plural = "" if len(missing) == 1 else "s"
-        message = (
-            f"{root} lacks the feature{plural} {', '.join(missing)}; it has {listed(features)}."
-        )
         has_cameras = all(name in columns for name in robot.camera_names)
-        if robot.action.space is not None and has_cameras:
-            raise UserError(
-                f"{message} The robot {robot.name!r} acts in another space than this dataset's"
-                " actions are of. Take a dataset that `mme-vla record` or `mme-vla convert` wrote,"
-                " which has poses and waypoints too, or another robot: embodiment=robomme_joint, or"
-                " a checkpoint that was trained in joint angles."
-            )
-        message += (
-            f" These are the names of the robot {robot.name!r}: choose embodiment=<the robot this"
-            " dataset is of>, or name its columns in a configs/embodiment file of your own."
-        )
-        for name in missing:
-            near = _near_column(name, features)
-            if near is not None:
-                message += f" Did you mean `key: {near}` for {name}?"
-        message += (
-            f" `mme-vla inspect dataset={root}` drafts that file, and docs/extend/your-robot.md"
-            " explains it."
-        )
-        raise UserError(message)
+        raise UserError(_missing_columns(root, features, robot, missing, has_cameras))
 
     cameras = {name: columns[name] for name in robot.camera_names}
     for name, column in cameras.items():
@@ -226,6 +187,59 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     tables += [name for name in SUBGOALS if name in features]
     tables += [column for column in cameras.values() if features[column].dtype == "image"]
     return Columns(cameras, state, action, pose, tuple(dict.fromkeys(tables)))
+
+
+def _spellings(robot: Embodiment) -> dict[str, list[str]]:
+    """By name of a camera or key of a vector: the columns that may hold it, the first one first."""
+    spellings: dict[str, list[str]] = {}
+    for camera in robot.cameras:
+        spellings[camera.name] = []
+        for name in (camera.key or camera.name, camera.name):
+            spellings[camera.name] += [name, f"observation.images.{name}"]
+    for key in (*robot.state.key, *robot.action.pose_key):
+        spellings[key] = [key, f"observation.{key}"]
+    for key in robot.action.key:
+        spellings[key] = [key]
+        if key in _ACTION:
+            spellings[key] += _ACTION
+    if not robot.state.key:
+        spellings["state"] = ["observation.state", "state"]
+    if not robot.action.key:
+        spellings["action"] = [*_ACTION]
+    return spellings
+
+
+def _missing_columns(
+    root: Path,
+    features: Mapping[str, Feature],
+    robot: Embodiment,
+    missing: Sequence[str],
+    has_cameras: bool,
+) -> str:
+    """The message for columns that a dataset lacks; with all cameras there, it is of another action
+    space.
+    """
+    plural = "" if len(missing) == 1 else "s"
+    message = f"{root} lacks the feature{plural} {', '.join(missing)}; it has {listed(features)}."
+    if robot.action.space is not None and has_cameras:
+        return (
+            f"{message} The robot {robot.name!r} acts in another space than this dataset's"
+            " actions are of. Take a dataset that `mme-vla record` or `mme-vla convert` wrote,"
+            " which has poses and waypoints too, or another robot: embodiment=robomme_joint, or"
+            " a checkpoint that was trained in joint angles."
+        )
+    message += (
+        f" These are the names of the robot {robot.name!r}: choose embodiment=<the robot this"
+        " dataset is of>, or name its columns in a configs/embodiment file of your own."
+    )
+    for name in missing:
+        near = _near_column(name, features)
+        if near is not None:
+            message += f" Did you mean `key: {near}` for {name}?"
+    return (
+        f"{message} `mme-vla inspect dataset={root}` drafts that file, and"
+        " docs/extend/your-robot.md explains it."
+    )
 
 
 def names_of(features: Sequence[Feature]) -> tuple[str, ...]:
@@ -362,9 +376,6 @@ def content_fingerprint(
     return digest.hexdigest()[:16]
 
 
-_MOST_FRAMES = 2**40  # of a dataset; a larger number is damage
-
-
 _HIDDEN = "."
 """Begins the names of files that are not the dataset's: macOS leaves `._<name>` beside what it
 copies to other disks.
@@ -388,172 +399,6 @@ def parquet_files(root: Path, folder: str) -> list[Path]:
         if not path.name.startswith(_HIDDEN):
             files.append(require_file(path, "a parquet table"))
     return sorted(files, key=in_order)
-
-
-@dataclass(frozen=True)
-class VideoSpans:
-    """Where the images of each episode lie in the video files of a column, [e] each.
-
-    chunk, file: numbers of the file, int64.
-    begin, end: seconds, float64; `end` may be missing.
-    """
-
-    chunk: np.ndarray
-    file: np.ndarray
-    begin: np.ndarray
-    end: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class EpisodeTable:
-    """`meta/episodes`.
-
-    starts, lengths: [e] int64, rows of the tables.
-    tasks: [e], those listed for each episode, none where they are not listed.
-    declared_lengths: the lengths once more, where they are written.
-    videos: by column.
-    """
-
-    starts: np.ndarray
-    lengths: np.ndarray
-    tasks: list[tuple[str, ...]]
-    declared_lengths: np.ndarray | None
-    videos: Mapping[str, VideoSpans]
-
-
-@dataclass(frozen=True)
-class Description:
-    """What is compared: the parts of a dataset that were read already.
-
-    root: its folder.
-    info: meta/info.json.
-    episodes: meta/episodes.
-    videos, images: columns of the cameras that are videos, and of those stored in the tables.
-    """
-
-    root: Path
-    info: Info
-    episodes: EpisodeTable
-    videos: tuple[str, ...]
-    images: tuple[str, ...]
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self.info.fps
-
-    @property
-    def starts(self) -> np.ndarray:
-        """First row of each episode, [e] int64."""
-        return self.episodes.starts
-
-    @property
-    def lengths(self) -> np.ndarray:
-        """Frames of each episode, [e] int64."""
-        return self.episodes.lengths
-
-    def place(self, row: int) -> str:
-        """A row in words, by its episode and frame."""
-        episode = int(np.searchsorted(self.starts, row, side="right")) - 1
-        return f"row {row}, frame {row - int(self.starts[episode])} of episode {episode}"
-
-
-def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable:
-    """Read and check `meta/episodes`.
-
-    Raises:
-        UserError: a column is missing, or a value that cannot be; it names the episode.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    meta = root / "meta" / "episodes"
-    kinds = dict.fromkeys(("episode_index", "dataset_from_index", "dataset_to_index"), pa.int64())
-    optional = {"length": pa.int64()}
-    for column in video_columns:
-        kinds[f"videos/{column}/chunk_index"] = pa.int64()
-        kinds[f"videos/{column}/file_index"] = pa.int64()
-        kinds[f"videos/{column}/from_timestamp"] = pa.float64()
-        optional[f"videos/{column}/to_timestamp"] = pa.float64()
-    with decoding(meta, "tables of episodes", REMEDY):
-        files = [pq.ParquetFile(file) for file in parquet_files(root, "meta/episodes")]
-        present = set.intersection(*(set(file.schema_arrow.names) for file in files))
-    missing = [name for name in kinds if name not in present]
-    if missing:
-        others = sorted(name for name in present if not name.startswith("stats/"))
-        raise UserError(
-            f"{meta} lacks {listed(missing)}, which LeRobot writes in every dataset of version"
-            f" v3.0. It has {listed(others)}."
-        )
-    kinds |= {name: kind for name, kind in optional.items() if name in present}
-
-    parts = []
-    cells: list[Any] = []
-    with decoding(meta, "tables of episodes", REMEDY):
-        for file in files:
-            if "tasks" in present:
-                part = file.read([*kinds, "tasks"])
-                cells += part["tasks"].to_pylist()
-            else:
-                part = file.read([*kinds])
-                cells += [None] * part.num_rows
-            parts.append(part.select(list(kinds)).cast(pa.schema(list(kinds.items()))))
-        table = pa.concat_tables(parts)
-        empty = [name for name in kinds if table[name].null_count]
-        columns = {name: table[name].to_numpy() for name in kinds}
-    require(
-        not empty and table.num_rows,
-        f"{meta} describes {counted(table.num_rows, 'episode')}; empty cells in:"
-        f" {listed(empty) or 'none'}."
-        f" {REMEDY}",
-    )
-
-    numbers = columns["episode_index"]
-    starts, stops = columns["dataset_from_index"], columns["dataset_to_index"]
-    before = np.concatenate([[0], stops[:-1]])
-    checks = {
-        "episode_index": (numbers == np.arange(len(numbers)), "0, 1, 2, …"),
-        "dataset_from_index": (starts == before, "the row after the episode before"),
-        "dataset_to_index": ((stops > starts) & (stops <= _MOST_FRAMES), "at least one row"),
-    }
-    videos = {}
-    for column in video_columns:
-        name = f"videos/{column}"
-        spans = VideoSpans(
-            columns[f"{name}/chunk_index"],
-            columns[f"{name}/file_index"],
-            columns[f"{name}/from_timestamp"],
-            columns.get(f"{name}/to_timestamp"),
-        )
-        for key, values in (("chunk_index", spans.chunk), ("file_index", spans.file)):
-            checks[f"{name}/{key}"] = ((values >= 0) & (values <= _MOST_FRAMES), "a number")
-        is_time = np.isfinite(spans.begin) & (spans.begin >= 0)
-        checks[f"{name}/from_timestamp"] = (is_time, "seconds from 0")
-        videos[column] = spans
-    for name, (valid, expected) in checks.items():
-        if not valid.all():
-            episode = int(np.argmin(valid))
-            value = brief(columns[name][episode].item())
-            raise UserError(
-                f"{meta}: {name} of episode {episode} is {value}; expected {expected}. {REMEDY}"
-            )
-    tasks = [_listed_tasks(meta, episode, cell) for episode, cell in enumerate(cells)]
-    return EpisodeTable(starts, stops - starts, tasks, columns.get("length"), videos)
-
-
-def _listed_tasks(meta: Path, episode: int, cell: Any) -> tuple[str, ...]:
-    """The tasks of an episode: LeRobot writes a list of texts; one text alone, an empty list or
-    nothing is read too.
-    """
-    if cell is None:
-        return ()
-    texts = cell if isinstance(cell, list) else [cell]
-    if not all(isinstance(text, str) for text in texts):
-        raise UserError(
-            f"{meta}: tasks of episode {episode} is {brief(cell)}; expected a list of texts."
-            f" {REMEDY}"
-        )
-    return tuple(texts)
 
 
 def read_tasks(root: Path) -> list[str]:

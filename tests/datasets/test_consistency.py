@@ -31,10 +31,10 @@ from helpers.lerobot_tables import (
     write_dataset,
     write_video,
 )
+from mme_vla.data.episode_table import EpisodeTable
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import (
     SAMPLE,
-    EpisodeTable,
     Feature,
     Info,
     content_fingerprint,
