@@ -185,18 +185,18 @@ class VecEnv:
         self.start(worker, job)
         return job
 
-    def start(self, worker: int, job: Job, draw: RenderRequest | None = None) -> None:
+    def start(self, worker: int, job: Job, images: RenderRequest | None = None) -> None:
         """Let a worker begin an episode; its reply carries the first observation.
 
         Args:
-            draw: the images that are requested of the reset, where the environment takes chunks;
+            images: those that are requested of the reset, where the environment takes chunks;
                 by default all.
         """
         state = self._idle(worker)
         state.job = job
         state.resetting = True
         arguments = {"task": job.task, "split": job.split, "episode": job.episode}
-        options = {} if draw is None else {"draw": draw}
+        options = {} if images is None else {"images": images}
         self._command(worker, protocol.RESET, arguments, options)
 
     def send(self, worker: int, action: Any) -> None:

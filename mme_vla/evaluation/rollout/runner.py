@@ -20,7 +20,7 @@ from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError, place_of, text_of
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, checkpoint_number
-from mme_vla.evaluation.rollout.environment import Command
+from mme_vla.evaluation.rollout.environment import ChunkCommand
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import RolloutProgress
@@ -76,7 +76,7 @@ class Environments(Protocol):
     def workers(self) -> int: ...
     @property
     def busy(self) -> bool: ...
-    def start(self, worker: int, job: Job, draw: RenderRequest | None = None) -> None: ...
+    def start(self, worker: int, job: Job, images: RenderRequest | None = None) -> None: ...
     def send(self, worker: int, action: object) -> None: ...
     def recv(self, timeout: float | None = None) -> list[Reply]: ...
 
@@ -253,7 +253,7 @@ class Rollout:
         )
         running.worker = worker
         self._running[worker] = running
-        self.envs.start(worker, job, draw=self._render_plan.before_video())
+        self.envs.start(worker, job, images=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
         """Deal with what came back from a worker."""
@@ -333,7 +333,7 @@ class Rollout:
         if missing is None:
             return False
         running.first_video_frames = length
-        self.envs.start(running.worker, running.job, draw=missing)
+        self.envs.start(running.worker, running.job, images=missing)
         return True
 
     def _run_scheduler(self) -> None:
@@ -357,8 +357,8 @@ class Rollout:
         if event is None:
             self._scheduler.acting.append(running)
             return
-        draw = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
-        command = Command(hold=event.hold, subgoal=running.episode.subgoal, draw=draw)
+        images = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
+        command = ChunkCommand(hold=event.hold, subgoal=running.episode.subgoal, images=images)
         self.envs.send(running.worker, command)
 
     def _act(self, batch: list[RunningEpisode]) -> None:
@@ -386,8 +386,8 @@ class Rollout:
                 )
                 continue
             running.set_actions(actions)
-            draw = self._render_plan.of_chunk(running, len(actions))
-            command = Command(actions, subgoal=running.episode.subgoal, draw=draw)
+            images = self._render_plan.of_chunk(running, len(actions))
+            command = ChunkCommand(actions, subgoal=running.episode.subgoal, images=images)
             self.envs.send(running.worker, command)
             self._scheduler.later[running] = None
 

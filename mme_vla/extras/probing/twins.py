@@ -33,8 +33,8 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, mean_interval
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.environment import (
+    ChunkCommand,
     ChunkEnv,
-    Command,
     base_env,
     make_rollout_env,
 )
@@ -236,9 +236,9 @@ class TwinScenes:
                 if action is None:
                     raise NoPairError("the demonstrator reaches no decision that depends on a fact")
                 actions.append(action)
-                draw = self._plan.of_chunk(first, 1)
+                images = self._plan.of_chunk(first, 1)
                 frames, _, terminated, truncated, report = env.step(
-                    Command(action[None], draw=draw)
+                    ChunkCommand(action[None], images=images)
                 )
                 if terminated or truncated:
                     raise NoPairError("the demonstrator ends it before a decision")
@@ -270,9 +270,9 @@ class TwinScenes:
         try:
             env.reset(NOTHING)
             for action in decision.actions:
-                env.step(Command(action[None], draw=NOTHING))
+                env.step(ChunkCommand(action[None], images=NOTHING))
             start = base.tool
-            env.step(Command(chunk, draw=NOTHING))
+            env.step(ChunkCommand(chunk, images=NOTHING))
             return share_correct(decision.candidates, start, base.tool)
         finally:
             env.close()
