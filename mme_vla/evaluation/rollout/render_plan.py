@@ -15,7 +15,6 @@ import numpy as np
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.episode import RunningEpisode
-from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
@@ -42,9 +41,7 @@ class RenderPlan:
         self._grounded = subgoals is not None and subgoals.kind == "grounded"
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
-        events = read_events(settings.event)
-        self._hold_steps = sum(event.perturbation.hold for event in events)
-        self._resampled = any(event.resamples_video for event in events)
+        self._resampled = any(event.resamples_video for event in settings.events)
         memory = policy.memory
         every = memory is not None and memory.past_view_spec is not None
         self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
@@ -127,10 +124,10 @@ class RenderPlan:
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""
         action = self._robot.action
-        most = self._settings.step_limit + self._hold_steps + 2
+        most = self._settings.step_limit + self._settings.hold_steps + 2
         # A motion, or an event that holds the robot, takes any number of frames: the policy may act
         # at each.
-        if action.frames is None or self._hold_steps:
+        if action.frames is None or self._settings.hold_steps:
             return self._read_before(exec_start + np.arange(most + LONGEST_MOTION), exec_start)
         apart = min(self._settings.execute or action.execute, action.horizon)
         return self._policy.frames_read(exec_start + np.arange(0, most, apart), exec_start)

@@ -22,7 +22,6 @@ from mme_vla.errors import SceneError, UserError, place_of, text_of
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, checkpoint_number
 from mme_vla.evaluation.rollout.environment import ChunkCommand
 from mme_vla.evaluation.rollout.episode import RunningEpisode
-from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -191,7 +190,7 @@ class Rollout:
         self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(
             settings.max_batch
         )
-        self._events = read_events(settings.event)
+        self._events = settings.events
         self._render_plan = RenderPlan(policy, subgoals, settings)
 
     # What a subclass may override -----------------------------------------------------------------
