@@ -50,10 +50,10 @@ TRAINING = [
 """
 EVALUATION = [
     ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
-    ("evaluation/rollout/evaluation.py", "run_episodes"), ("evaluation/store.py", "claim_run"),
+    ("evaluation/rollout/evaluation.py", "run"), ("evaluation/store.py", "claim_run"),
     ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
     ("envs/vector/worker.py", "serve"), ("evaluation/rollout/environment.py", "step"),
-    ("evaluation/rollout/episode.py", "read"), ("evaluation/rollout/render_plan.py", "of_chunk"),
+    ("evaluation/rollout/episode.py", "read"), ("evaluation/rollout/episode.py", "of_chunk"),
     ("policy/scheduler.py", "next_steps"), ("evaluation/records.py", "to_json"),
 ]  # fmt: skip
 """From the command line to the line of an episode's record. Beside it: what a terminal shows

@@ -19,15 +19,14 @@ from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError, place_of, text_of
-from mme_vla.evaluation.records import EpisodeRecord, RunKey, checkpoint_number
+from mme_vla.evaluation.records import EpisodeRecord, OfRun
 from mme_vla.evaluation.rollout.environment import ChunkCommand
-from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.episode import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
-from mme_vla.policy.base import Policy
+from mme_vla.policy.base import Policy, frames_a_piece
 from mme_vla.policy.episode import Failure
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.policy.training_identity import TrainingIdentity
@@ -81,7 +80,7 @@ class Environments(Protocol):
 
 
 @dataclass(frozen=True)
-class RunFacts:
+class RunFacts(OfRun):
     """What all records of a run have in common; the fields are those of `EpisodeRecord`."""
 
     model: str
@@ -94,21 +93,6 @@ class RunFacts:
     composition: str | None = None
     training: TrainingIdentity | None = None
     event: str | None = None
-
-    @property
-    def run(self) -> RunKey:
-        """The run that its records are of."""
-        return RunKey(
-            model=self.model,
-            subgoal=self.subgoal,
-            memory_budget=self.memory_budget,
-            checkpoint=checkpoint_number(self.checkpoint),
-            model_seed=self.model_seed,
-            split=self.split,
-            composition=self.composition,
-            training=self.training,
-            event=self.event,
-        )
 
 
 @dataclass
@@ -156,7 +140,6 @@ class Rollout:
         subgoals: SubgoalPredictor | None = None,
         subgoal_folder: Path | None = None,
         progress: RolloutProgress | None = None,
-        workload: Workload | None = None,
     ) -> None:
         """Prepare a rollout; `run` does it.
 
@@ -169,7 +152,6 @@ class Rollout:
             subgoal_folder: where every subgoal is written down with its image; None keeps the
                 scores alone.
             progress: is told of every record.
-            workload: counts what the policy does.
         """
         self.policy = policy
         self.envs = envs
@@ -179,7 +161,7 @@ class Rollout:
         self.subgoals = subgoals
         self.subgoal_folder = subgoal_folder
         self.progress = progress or RolloutProgress(0, visible=False)
-        self.workload = workload or Workload()
+        self.workload = Workload()
         self._waiting = Waiting()
         self._running: dict[int, RunningEpisode] = {}  # by worker
         self._tries: Counter[Job] = Counter()
@@ -239,9 +221,7 @@ class Rollout:
         if job is None:
             return
         self._tries[job] += 1
-        piece = self.settings.encode_chunk
-        if self.policy.memory is not None:  # of some memories most frames are never encoded
-            piece *= self.policy.memory.storage.keep_every
+        piece = frames_a_piece(self.policy, self.settings.encode_chunk)
         trace = None
         if self.subgoals is not None:
             trace = SubgoalTrace(
@@ -281,7 +261,7 @@ class Rollout:
             message = running.report.error
         else:
             status = "error"
-            message = f"{reply.job}: {text_of(reply.error)}"
+            message = reply.info["error_message"]
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
         # A scene in which an object finds no place finds none again, and says nothing of the
@@ -439,7 +419,7 @@ class Rollout:
             episode=job.episode,
             seed=spec.seed,
             difficulty=spec.difficulty,
-            scene=running.scene,
+            scene=running.report.scene,
             outcome=ending.outcome,
             steps=running.steps,
             seconds=running.seconds,
@@ -452,7 +432,7 @@ class Rollout:
             suite=source.suite_of(job.task),
             groups=source.groups_of(job.task) or None,
             refused=None if failed else ending.error,
-            video=running.video,
+            video=running.report.video,
             process=running.process,
             events=tuple(running.events.log),
             subgoals=None if running.trace is None else running.trace.score.to_dict(),
