@@ -314,9 +314,8 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
     """Give records without a digest the one that others of their run have; only for the records of
     one folder.
 
-    `run.json` sees to it that a folder holds one configuration: a run that was begun before records
-    had digests and ended after is one run. Where a run's other records have none, or several,
-    nothing is assumed.
+    A run that was begun before records had digests, and ended after, is one run. Where a run's
+    other records have none, or several, nothing is assumed.
     """
     digests: dict[RunKey, set[str]] = {}
     for record in records:

@@ -325,7 +325,7 @@ class VecEnv:
         return self._replace(index, WorkerCrash(f"the worker process {what}"))
 
     def _replace(self, index: int, error: Exception) -> Reply:
-        """Start a new process for a worker; the reply reports the failure of its command."""
+        """Start a new process for a worker, and report the failure of its command."""
         old = self._workers[index]
         old.connection.close()
         protocol.end(old.process)

@@ -1,9 +1,8 @@
 """The environment's side of a rollout, in a worker process: executes whole chunks and hands back
 every frame.
 
-A worker gets a chunk at a time, so it simulates on while the policy acts in others. Its frames come
-in the form the policy reads. What the benchmark's interface says in dictionaries becomes a `Report`
-here.
+Its frames come in the form the policy reads. What the benchmark's interface says in dictionaries
+becomes a `Report`.
 """
 
 import time
@@ -47,15 +46,13 @@ The robot's `readings`, if it has any, are lists of all frames.
 
 
 def is_out_of_reach(observation: Mapping[str, Any] | None, info: Mapping[str, Any]) -> bool:
-    """Whether an environment's `error` means that no joints or no motion reach what was asked for:
-    the policy failed, not the machine.
-    """
+    """Whether an environment's `error` is of the policy, whose target no motion reaches."""
     return observation == {} or info.get("exception_type") == "PlanningError"
 
 
 @dataclass(frozen=True)
 class ChunkCommand:
-    """What an environment executes next: actions, or a time for which the robot stays where it is.
+    """What an environment executes next.
 
     actions: [n, w], executed one after the other; None with `hold`.
     hold: control steps for which the robot stays where it is.
@@ -268,7 +265,7 @@ class ChunkEnv:
     def _execute(
         self, action: "np.ndarray | Hold", frames: "Frames", subgoal: str | None
     ) -> StepOutcome:
-        """Execute one action, add what it led to to the frames and to the video."""
+        """Execute one action, and add its frames."""
         with self._simulation():
             observation, reward, terminated, truncated, info = self._env.step(self._command(action))
         outcome = StepOutcome(info, float(reward), bool(terminated), bool(truncated))
@@ -300,7 +297,6 @@ class ChunkEnv:
         self._env.close()
 
     def _command(self, action: "np.ndarray | Hold") -> Any:
-        """What the environment takes for an action [w] of the policy."""
         if isinstance(action, Hold):
             return action
         self._last = action
@@ -384,7 +380,6 @@ class ChunkEnv:
         return report
 
     def _add_reset_to_video(self, frames: "Frames", count: int) -> None:
-        """Add the conditioning video, and the current frame, to the episode's video."""
         if self._video is None:
             return
         for number, views in enumerate(frames.newest(count), 1):
@@ -394,7 +389,6 @@ class ChunkEnv:
             self._video.add(views, self._goal, caption, demo=number < count)
 
     def _add_to_video(self, frames: "Frames", outcome: StepOutcome, subgoal: str | None) -> None:
-        """Add the frames of an action."""
         if self._video is None:
             return
         first = self._steps - outcome.frames + 1

@@ -44,12 +44,9 @@ def select_frames(frames: Observation, numbers: np.ndarray) -> Observation:
 class RunningEpisode:
     """One episode between its first observation and its end.
 
-    In a round `begin` or `resume` takes the frames, `read` has the policy observe them,
+    In a round `begin` or `resume` takes the frames, `read` has the policy observe a piece of them,
     `set_subgoal` and `set_actions` take what was decided, and the environment executes it. `end`
     counts the last actions.
-
-    Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of
-    a conditioning video do not keep other episodes waiting.
 
     subgoals: predicts the subgoal.
     piece: frames to a piece.
@@ -99,7 +96,7 @@ class RunningEpisode:
     # Observe: frames arrive, and are read piece by piece
 
     def take_report(self, report: Report) -> None:
-        """Note what the environment says: its time, its scene, and what there is to choose."""
+        """Note what the environment says."""
         self.report = report
         self._sim += report.simulated_s
         self._render += report.rendered_s
@@ -108,8 +105,7 @@ class RunningEpisode:
             self.episode.options = read_options(report.options, len(self._robot.action.choice))
 
     def begin(self, frames: Observation) -> None:
-        """Take the first observation: a conditioning video, if the task has one, and the current
-        frame.
+        """Take the conditioning video, if the task has one, and the current frame.
 
         Raises:
             UserError: the environment names no goal.
@@ -132,9 +128,7 @@ class RunningEpisode:
         self._queue(frames, np.arange(self.video_frames + 1) < self.video_frames, None)
 
     def resume(self, frames: Observation) -> None:
-        """Take the frames that the executed actions led to: one each, unless an action is a motion
-        of many.
-        """
+        """Take the frames that the executed actions led to."""
         self._count_executed()
         length = len(frames["state"])
         has_one_a_frame = self._robot.action.frames is not None
@@ -159,12 +153,12 @@ class RunningEpisode:
         self._queue(frames, np.zeros(n_frames, bool), leading)
 
     def _note_observed(self, length: int, observed: np.ndarray) -> None:
-        """Note which of the environment's next `length` frames the policy observes, int64 [n]."""
+        """Note which of the next `length` frames the policy observes, int64 [n]."""
         self._visible = np.concatenate([self._visible, self._simulated + observed])
         self._simulated += length
 
     def _queue(self, frames: Observation, demo: np.ndarray, leading: np.ndarray | None) -> None:
-        """Have these frames wait to be read; `leading` are the actions that led to them."""
+        """Have frames wait to be read, with the actions that led to them."""
         if len(frames["state"]) != len(demo):
             raise UserError(
                 f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
@@ -232,7 +226,7 @@ class RunningEpisode:
     # Decide and act
 
     def set_subgoal(self, subgoal: Subgoal, latency_s: float) -> None:
-        """Take the subgoal of the current frame, which came after so many seconds."""
+        """Take the subgoal of the current frame."""
         self.episode.subgoal = subgoal.text
         if self.trace is not None:
             self.trace.add(self.watched, subgoal, latency_s)
@@ -249,7 +243,6 @@ class RunningEpisode:
     # Record
 
     def _count_executed(self) -> None:
-        """Count the actions of the last command, for the record."""
         executed = self._sent[: self.report.executed]
         self.steps += self.report.frames
         self._actions.update(np.ascontiguousarray(executed, np.float32).tobytes())
@@ -277,9 +270,7 @@ class RunningEpisode:
 
     @property
     def actions_sha256(self) -> str:
-        """A digest of all executed actions: equal for two runs exactly if they did the same to the
-        last bit.
-        """
+        """A digest of all executed actions, to the last bit."""
         return self._actions.hexdigest()[:16]
 
 
@@ -292,10 +283,9 @@ class RenderPlan:
     """The images to render for each command to an environment: those that the policy and its
     predictor read; None requests everything.
 
-    When a policy acts is known beforehand, so what its memory reads is too, but for one thing: how
-    long the conditioning video is. An episode therefore begins without those of its images that
-    depend on it. Where some turn out to be needed, it begins once more, and the same simulation
-    then renders them.
+    When a policy acts, and so what its memory reads, is known before the episode, but for the
+    length of the conditioning video. Where images of it turn out to be needed, the episode begins
+    once more, and the same simulation then renders them.
 
     policy, subgoals: the readers.
     settings: how often the policy acts, and whether all is rendered (`draw`).
@@ -319,7 +309,7 @@ class RenderPlan:
         self._all = settings.draw == "all" or bool(self._robot.readings) or self._reads(0) is None
 
     def before_video(self) -> RenderRequest | None:
-        """For a reset, before it is known how long the video is: what is certain to be wanted."""
+        """For a reset, before it is known how long the video is."""
         if self._all:
             return None
         if self._sees_video or self._resampled:
@@ -327,9 +317,7 @@ class RenderPlan:
         return self._render_request(self._read_of_videos)
 
     def missing(self, frames: Observation) -> RenderRequest | None:
-        """For a second reset, after one that gave these frames; None where it gave all that is
-        needed.
-        """
+        """For a second reset, if one that gave these frames left out some that are needed."""
         if self._all or self._resampled:
             return None
         video = len(frames["state"]) - 1
@@ -370,18 +358,14 @@ class RenderPlan:
 
     @cached_property
     def _read_of_videos(self) -> Container[int]:
-        """Frames that the policy may read of a video, however long it is; none where that may be
-        most of them.
-        """
+        """Frames that the policy may read of any video; none where that may be most of them."""
         read = self._read_before(np.arange(LONGEST_VIDEO), LONGEST_VIDEO)
         if read is None or len(read) >= LONGEST_VIDEO / 2:
             return frozenset()
         return frozenset(read.tolist())
 
     def _read_before(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """Frames that the policy reads at any of these steps, but for the current one, which is
-        rendered anyway.
-        """
+        """Frames that the policy reads at any of these steps, beside the current one."""
         lists = []
         for step in steps:
             read = self._policy.frames_read(np.array([step]), exec_start)

@@ -1,6 +1,4 @@
-"""A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode
-at once.
-"""
+"""A whole evaluation, from `mme_vla.evaluate` to the records in the run's folder."""
 
 import logging
 import os
@@ -63,11 +61,12 @@ class Shard:
 
 
 class Evaluation(NamedTuple):
-    """The outcome of a run: the records of its episodes, old and new, and what the policy did this
-    time.
+    """The outcome of a run.
 
-    Of several processes that share a run each has the records that it wrote. output: the run's
-    folder. matched: the records of the plain run, where `records` are of events.
+    records: of its episodes, old and new; of a shard, those that it wrote.
+    workload: what the policy did this time.
+    output: the run's folder.
+    matched: the records of the plain run, where `records` are of events.
     """
 
     records: list[EpisodeRecord]
@@ -184,9 +183,7 @@ def choose_episodes(
     split: str = "test",
     env: str = "mme_vla",
 ) -> list[Job]:
-    """The episodes of a run, task by task, by the grammar of all commands
-    (`mme_vla.envs.episodes`).
-    """
+    """The episodes of a run, task by task."""
     return [
         Job(spec.task, spec.split, spec.episode)
         for spec in choose_specs(tasks, episodes, split, env)
@@ -214,7 +211,7 @@ def choose_shard(text: str | None, variables: Mapping[str, str] | None = None) -
 
 
 def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
-    """A policy, and where its weights are from; one that is given keeps to itself."""
+    """A policy, and where its weights are from."""
     if isinstance(policy, Policy):
         return policy, None
     source = locate_checkpoint(policy)
@@ -222,18 +219,14 @@ def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
 
 
 def predictor_of(policy: Policy, subgoal: str | SubgoalPredictor | None) -> SubgoalPredictor | None:
-    """A predictor by its name, of the kind of subgoals that the policy reads; one that is given
-    stays as it is.
-    """
+    """A predictor of the kind of subgoals that the policy reads."""
     if isinstance(subgoal, str):
         return build_predictor({"name": subgoal, **kind_section(policy)})
     return subgoal
 
 
 def kind_section(policy: Policy) -> dict[str, str]:
-    """The key `kind` of a predictor's section: what the policy was trained to read. Empty where it
-    does not say.
-    """
+    """The key `kind` of a predictor's section, where the policy says what it reads."""
     kind = subgoal_kind(policy)
     return {} if kind is None else {"kind": kind.removesuffix("_subgoal")}
 
@@ -358,10 +351,8 @@ class EvaluationRun:
     options: RunOptions = RunOptions()
 
     def run_with_events(self, events: Sequence[str]) -> Evaluation:
-        """Run every episode, then once more under each event, in a folder of its own below.
-
-        The runs have the same scenes and the same noise, and differ in the event alone. Without
-        events it is `run`.
+        """Run every episode, then once more under each event, with the same scenes and noise, in a
+        folder of its own below.
 
         events: arms, such as `pause:100@subtask:2`.
         """
@@ -574,7 +565,5 @@ def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, 
 
 
 def _end_of(place: str | None) -> str | None:
-    """The end of a path alone: machines that share a run may have the folder at
-    different places.
-    """
+    # Machines that share a run may have the folder at different places.
     return None if place is None else "/".join(Path(place).parts[-4:])

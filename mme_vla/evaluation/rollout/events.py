@@ -94,8 +94,7 @@ def event_arms(value: Any) -> list[str]:
 class EventCourse:
     """The events of one running episode.
 
-    log: of each its text as `event`, and as `step` the control step at which it acted; None while
-        it has not.
+    log: each event, and when it acted.
     hold_steps: control steps for which events held the robot.
     holding: what holds it, if its frames come next.
     """
@@ -116,8 +115,7 @@ class EventCourse:
         return real
 
     def next(self, episode: "Episode", step: int, subtask: int) -> None:
-        """Let events take place that are due at this decision, up to one that holds the robot,
-        which is then `holding`.
+        """Let events take place that are due, up to one that holds the robot.
 
         Args:
             step: control steps so far.

@@ -1,8 +1,7 @@
 """Many episodes at once: environments in worker processes, one policy that acts for the waiting
 ones in one batch.
 
-Each worker executes its chunk at its own pace. One that has finished is in the policy's next batch.
-No episode waits for a slow one, and a long conditioning video is read in pieces between batches.
+Each worker executes its chunk at its own pace, and joins the policy's next batch when it is done.
 """
 
 import time
@@ -149,8 +148,8 @@ class Rollout:
             facts: what the records say of the policy.
             record: called with every record, as soon as there is one.
             subgoals: predicts the subgoal; None leaves it out of the prompt.
-            subgoal_folder: where every subgoal is written down with its image; None keeps the
-                scores alone.
+            subgoal_folder: where every subgoal is logged with its image; None keeps the scores
+                alone.
             progress: is told of every record.
         """
         self.policy = policy
@@ -198,9 +197,7 @@ class Rollout:
             pass
 
     def rounds(self, jobs: Sequence[Job] | Waiting) -> Iterator[None]:
-        """Run these episodes; yields whenever the policy has done what it could for those that
-        wait.
-        """
+        """Run these episodes; yields after each turn of the policy."""
         begun = time.perf_counter()
         if not isinstance(jobs, Waiting):
             jobs = Waiting(jobs)
@@ -235,7 +232,6 @@ class Rollout:
         self.envs.start(worker, job, images=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
-        """Deal with what came back from a worker."""
         running = self._running[reply.worker]
         self._scheduler.later.pop(running, None)
         self.on_reply(running, reply)
@@ -278,13 +274,11 @@ class Rollout:
         self._finish(running, status, message, retry=not is_unbuildable)
 
     def _check_same_error(self, running: RunningEpisode, reply: Reply) -> None:
-        """Stop if the environment's own code failed twice in the same way: it will again.
-
-        Episodes that are tried again do not count, as all that failed for rare reasons meet there.
-        """
+        """Stop if the environment's own code failed twice in the same way: it will again."""
         if reply.error is None:
             self._same_errors = 0
             return
+        # In episodes that are tried again, all that failed for rare reasons meet.
         if place_of(reply.error) is None or self._tries[running.job] > 1:
             return
         text = text_of(reply.error)
@@ -330,7 +324,7 @@ class Rollout:
         self.workload.policy_s += time.perf_counter() - begun
 
     def _proceed(self, running: RunningEpisode) -> None:
-        """Have the policy act, unless an event holds the robot first; every frame is read."""
+        """Have the policy act, unless an event holds the robot first."""
         running.events.next(running.episode, running.steps, running.report.subtask)
         event = running.events.holding
         if event is None:
@@ -371,11 +365,7 @@ class Rollout:
             self._scheduler.later[running] = None
 
     def _give_up(self, running: RunningEpisode, failure: Failure) -> None:
-        """End an episode in which the policy cannot act any more.
-
-        Raises:
-            UserError: it chose no chunk in many episodes in a row.
-        """
+        """End an episode in which the policy cannot act any more."""
         if not running.chunks:
             self._inactive += 1
         if self._inactive >= GIVE_UP_AFTER:
@@ -388,17 +378,14 @@ class Rollout:
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
     ) -> None:
-        """End an episode and let its worker begin another.
-
-        An episode that is tried again leaves a record with the outcome `error`, which the record of
-        the repetition supersedes (`records.merge`).
-        """
+        """End an episode and let its worker begin another."""
         outcome = status
         if status not in ("success", "fail", "timeout"):
             outcome = "error"
             error = error or f"the environment ended the episode with the status {status!r}"
         running.episode.close()
         again = outcome == "error" and retry and self._tries[running.job] <= self.settings.retries
+        # The record of an error is superseded by that of the repetition (`records.merge`).
         self.on_end(running, Ending(outcome, error, again))
         if again:
             self._waiting.put_back(running.job)
