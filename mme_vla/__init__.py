@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
     from mme_vla.envs.vector.pool import make_vec_env
     from mme_vla.errors import UserError
-    from mme_vla.evaluation.api import evaluate
+    from mme_vla.evaluation.rollout.evaluation import evaluate
     from mme_vla.extras.probing.run import probe
     from mme_vla.integration.base import Integration
     from mme_vla.memory.base import Memory, PerceptualMemory
@@ -46,7 +46,7 @@ _MODULES = {
     "envs.task": ["Task"],
     "envs.vector.pool": ["make_vec_env"],
     "errors": ["UserError"],
-    "evaluation.api": ["evaluate"],
+    "evaluation.rollout.evaluation": ["evaluate"],
     "integration.base": ["Integration"],
     "memory.base": ["Memory", "PerceptualMemory"],
     "memory.history": ["CachedHistory", "History", "OnlineHistory", "StorageSpec"],

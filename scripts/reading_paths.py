@@ -50,15 +50,18 @@ TRAINING = [
 """
 EVALUATION = [
     ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
-    ("evaluation/rollout/evaluation.py", "run_episodes"), ("evaluation/store.py", "claim_run"),
+    ("evaluation/rollout/evaluation.py", "run"), ("evaluation/store.py", "claim_run"),
     ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
     ("envs/vector/worker.py", "serve"), ("evaluation/rollout/environment.py", "step"),
-    ("evaluation/rollout/episode.py", "read"), ("evaluation/rollout/render_plan.py", "of_chunk"),
-    ("policy/scheduler.py", "next_steps"), ("evaluation/records.py", "to_json"),
+    ("envs/make.py", "make_env"), ("envs/interface.py", "step"),
+    ("evaluation/rollout/episode.py", "read"), ("policy/episode.py", "observe"),
+    ("policy/scheduler.py", "next_steps"), ("policy/base.py", "act"),
+    ("evaluation/records.py", "to_json"),
 ]  # fmt: skip
-"""From the command line to the line of an episode's record. Beside it: what a terminal shows
-(`rollout/progress.py`), the run's receipt (`receipts.py`), and, where they are asked for, events
-(`rollout/events.py`), subgoals (`rollout/subgoals.py`) and videos (`rollout/video.py`).
+"""From the command line to the line of an episode's record; (d) continues from `act`. Beside it:
+what a terminal shows (`rollout/progress.py`), the run's receipt (`receipts.py`), and, where they
+are asked for, events (`rollout/events.py`), subgoals (`rollout/subgoals.py`) and videos
+(`rollout/video.py`).
 """
 ALONE = "README.md"
 QUESTIONS = (

@@ -53,11 +53,7 @@ SUBGOAL_MODES = ("inline", "background")
 
 @dataclass(frozen=True)
 class EvalRun:
-    """An evaluation as a command line describes it: `configs/evaluate.yaml`, read once.
-
-    Its keys beside those of `RolloutSettings` and `PolicyChoice`, which are read from `config`, the
-    whole configuration as plain values.
-    """
+    """An evaluation as a command line describes it: the keys of `configs/evaluate.yaml`."""
 
     episodes: Any
     event: Any
@@ -85,9 +81,7 @@ class EvalRun:
 
 
 def main(cfg: DictConfig) -> None:
-    """Run the episodes that have no result yet; of a folder of trainings those of one training
-    after the other.
-    """
+    """Evaluate a policy; of a folder of trainings one after the other."""
     config = policy_config(cfg)
     run = EvalRun.from_config(config)
     trainings = []

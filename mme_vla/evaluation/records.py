@@ -120,8 +120,18 @@ class EventEntry(TypedDict):
     step: Integer | None
 
 
+class OfRun:
+    """What belongs to a run: it has the fields of a `RunKey`."""
+
+    @property
+    def run(self) -> RunKey:
+        values = {name: getattr(self, name) for name in RunKey._fields}
+        values["checkpoint"] = checkpoint_number(values["checkpoint"])
+        return RunKey(**values)
+
+
 @dataclass(frozen=True)
-class EpisodeRecord:
+class EpisodeRecord(OfRun):
     """One evaluated episode.
 
     model: name of the model (`framesamp_modul`).
@@ -208,20 +218,6 @@ class EpisodeRecord:
     @property
     def success(self) -> bool:
         return self.outcome == "success"
-
-    @property
-    def run(self) -> RunKey:
-        return RunKey(
-            model=self.model,
-            subgoal=self.subgoal,
-            memory_budget=self.memory_budget,
-            checkpoint=self.checkpoint,
-            model_seed=self.model_seed,
-            split=self.split,
-            composition=self.composition,
-            training=self.training,
-            event=self.event,
-        )
 
     @property
     def named_scene(self) -> str | None:
@@ -318,9 +314,8 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
     """Give records without a digest the one that others of their run have; only for the records of
     one folder.
 
-    `run.json` sees to it that a folder holds one configuration: a run that was begun before records
-    had digests and ended after is one run. Where a run's other records have none, or several,
-    nothing is assumed.
+    A run that was begun before records had digests, and ended after, is one run. Where a run's
+    other records have none, or several, nothing is assumed.
     """
     digests: dict[RunKey, set[str]] = {}
     for record in records:

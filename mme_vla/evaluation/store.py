@@ -61,9 +61,8 @@ def claim_run(
 ) -> dict[str, Any]:
     """Begin a run in `folder`, or continue with the one that is there.
 
-    settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action
-        space, … notes: what does not (device, workers, versions); written down when the run begins,
-        never compared.
+    settings: plain values that decide the outcomes.
+    notes: what does not decide them; written down when the run begins, never compared.
 
     Returns:
         What `run.json` holds. Several shards may claim the same folder at once: the first writes
@@ -148,7 +147,7 @@ def _write_new(target: Path, text: str) -> None:
 
 
 def _await_content(path: Path, patience: float = 2) -> None:
-    """Without hard links another process may have made the file, but not filled it yet."""
+    # Without hard links another process may have made the file, but not filled it yet.
     end = time.monotonic() + patience
     while path.stat().st_size == 0 and time.monotonic() < end:
         time.sleep(0.05)
@@ -168,10 +167,7 @@ RECORDS = "episodes.jsonl"  # Name of a run's file; its shards are called `episo
 
 
 class RecordLog:
-    """Appends records to a file, each on disk when `append` returns. A context manager.
-
-    One process a file: the shards of a run write `episodes-<shard>.jsonl` side by side.
-    """
+    """Appends records to a file of this process, each on disk when `append` returns."""
 
     def __init__(self, path: Path) -> None:
         """Open or create `path`, and remove a half-written last line."""

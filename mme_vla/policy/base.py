@@ -405,6 +405,13 @@ def draw_noise(policy: Policy, count: int, generator: torch.Generator | None = N
     return stack_noise([policy.sampling_noise(generator) for _ in range(count)])
 
 
+def frames_a_piece(policy: Policy, encoded: int) -> int:
+    """Frames that are read at a time, for so many that are encoded: of some memories most never
+    are.
+    """
+    return encoded if policy.memory is None else encoded * policy.memory.storage.keep_every
+
+
 def choose_actions(
     policy: Policy,
     episodes: Sequence[Episode],

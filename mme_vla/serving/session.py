@@ -14,6 +14,7 @@ import numpy as np
 
 from mme_vla.embodiment.robomme import benchmark_action
 from mme_vla.errors import UserError
+from mme_vla.policy.base import frames_a_piece
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.engine import Engine
 from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset
@@ -40,6 +41,7 @@ class Session:
         self._engine = engine
         self._settings = settings
         self._seed = settings.seed
+        self._piece = frames_a_piece(engine.policy, settings.encode_chunk)
         self._begin()
 
     def _begin(self) -> None:
@@ -183,22 +185,15 @@ class Session:
         take: is given the piece of the request's frames, and which of them are of the conditioning
             video.
         """
-        piece = self._frames_a_piece()
-        for start in range(0, count, piece):
+        for start in range(0, count, self._piece):
             if start:
                 yield
-            part = slice(start, min(start + piece, count))
+            part = slice(start, min(start + self._piece, count))
             numbers = self.episode.n_observed_frames + np.arange(part.stop - start)
             take(part, numbers < self._exec_start)
 
-    def _frames_a_piece(self) -> int:
-        memory = self._engine.policy.memory
-        if memory is None:
-            return self._settings.encode_chunk
-        return self._settings.encode_chunk * memory.storage.keep_every
-
     def _n_pieces(self, count: int) -> int:
-        return max(1, -(-count // self._frames_a_piece()))
+        return max(1, -(-count // self._piece))
 
     def _check_capacity(self, count: int) -> None:
         total = self.episode.n_observed_frames + count

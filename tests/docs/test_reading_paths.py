@@ -11,3 +11,12 @@ def test_the_page_on_the_layout_has_the_counted_numbers() -> None:
     page = (REPOSITORY / "docs" / "extend" / "layout.md").read_text()
     for question, (take, _) in zip(reading_paths.QUESTIONS, reading_paths.answers(), strict=True):
         assert f"| {question} | {take} |" in page
+
+
+def test_the_path_of_an_episode_passes_the_simulation_and_the_policy() -> None:
+    for call in (
+        ("envs/interface.py", "step"),
+        ("policy/episode.py", "observe"),
+        reading_paths.SAMPLING[0],
+    ):
+        assert call in reading_paths.EVALUATION

@@ -25,7 +25,7 @@ from mme_vla.errors import UserError, place_of, set_place, text_of
 from mme_vla.evaluation.records import EpisodeRecord, by_run
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.tables import grouping_tables
-from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
+from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv
 from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.registry import ENVS
@@ -185,12 +185,12 @@ def test_images_that_are_functions_are_rendered_only_where_they_are_requested() 
     env = Corridors().open("Wide", "test", 0)
     chunks = ChunkEnv(lambda: env, robot=_robot())
     request = RenderRequest({"top": frozenset({2})}, ("top",))
-    chunks.reset(draw=RenderRequest({}, ()))
-    frames, *_, report = chunks.step(Command(np.ones((4, 1)), draw=request))
+    chunks.reset(images=RenderRequest({}, ()))
+    frames, *_, report = chunks.step(ChunkCommand(np.ones((4, 1)), images=request))
     assert env.env.renders == [2, 4], "the frame that is read, and the newest"
     assert [image is None for image in frames["top"]] == [True, False, True, False]
     assert report.rendered_s > 0
-    chunks.step(Command(np.ones((2, 1))))
+    chunks.step(ChunkCommand(np.ones((2, 1))))
     assert env.env.renders == [2, 4, 5, 6], "without a request all"
 
 

@@ -22,7 +22,7 @@ from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episod
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.data.waypoints import find_motions
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollout.environment import Command, base_env, make_rollout_env
+from mme_vla.evaluation.rollout.environment import ChunkCommand, base_env, make_rollout_env
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.serving.server import PolicyServer
@@ -218,7 +218,7 @@ def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(
     env = make_rollout_env(task, "train", 8, base=base, robot=panda)
     _, first = env.reset()
     assert not chooses or first.options == recorded_options
-    frames, _, terminated, _, report = env.step(Command(actions))
+    frames, _, terminated, _, report = env.step(ChunkCommand(actions))
     env.close()
     assert terminated and report.status == "success"
     assert len(frames["state"]) == report.frames >= report.executed

@@ -25,7 +25,7 @@ from helpers.scripted_env import VIDEO, make_moving_env, make_slow_env
 from mme_vla import MMEPolicy, Perturbation, UserError, build_policy, register
 from mme_vla.cli.results import main as results
 from mme_vla.config.composition import compose
-from mme_vla.envs.base import Environment, EpisodeEnv, Hold
+from mme_vla.envs.base import Environment, EpisodeEnv, Hold, environment
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
@@ -39,9 +39,8 @@ from mme_vla.evaluation.results.events import (
 )
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, wilson
-from mme_vla.evaluation.rollout.episode import EventCourse
-from mme_vla.evaluation.rollout.evaluation import RunOptions, run_with_events
-from mme_vla.evaluation.rollout.events import event_arms, read_events
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions
+from mme_vla.evaluation.rollout.events import EventCourse, event_arms, read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.processing.normalise import NormStats
@@ -235,7 +234,9 @@ def test_a_policy_whose_frames_have_no_numbers_cannot_restart(
     memoryless: MMEPolicy, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError, match="no memory that numbers frames"):
-        run_with_events(memoryless, JOBS, tmp_path, FACTS, RolloutSettings(), ["restart@step:4"])
+        EvaluationRun(memoryless, JOBS, tmp_path, FACTS, RolloutSettings()).run_with_events(
+            ["restart@step:4"]
+        )
 
 
 def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) -> None:
@@ -324,6 +325,22 @@ def test_a_custom_environment_names_the_action_that_keeps_its_robot() -> None:
         Rails().check_hold()
 
 
+def test_an_event_that_the_environment_cannot_take_is_refused_before_the_plain_run(
+    memoryless: MMEPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_inline_envs(monkeypatch)
+
+    def refuse(source: Any) -> None:
+        raise UserError("it cannot pause")
+
+    monkeypatch.setattr(type(environment("mme_vla")), "check_hold", refuse)
+    options = RunOptions(base=make_slow_env, show_progress=False)
+    run = EvaluationRun(memoryless, JOBS[:1], tmp_path, FACTS, RolloutSettings(), options)
+    with pytest.raises(UserError, match="it cannot pause"):
+        run.run_with_events(["pause:9"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_every_event_run_has_its_matched_arm(
     memoryless: MMEPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -331,8 +348,8 @@ def test_every_event_run_has_its_matched_arm(
     settings = RolloutSettings(max_steps=24, flow_steps=2, workers=2, max_batch=1)
     jobs = JOBS[2:4]
     options = RunOptions(base=make_slow_env, show_progress=False)
-    done = run_with_events(
-        memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], options
+    done = EvaluationRun(memoryless, jobs, tmp_path, FACTS, settings, options).run_with_events(
+        ["pause:9@subtask:30", "pause:9"]
     )
     assert [r.event for r in done.records] == ["pause:9@subtask:30"] * 2 + ["pause:9"] * 2
     baseline = {r.key: facts(r) for r in done.matched}
@@ -342,7 +359,8 @@ def test_every_event_run_has_its_matched_arm(
     assert all(
         r.steps != baseline[r.key][1] or facts(r) != baseline[r.key] for r in done.records[2:]
     )
-    again = run_with_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9"], options)
+    run = EvaluationRun(memoryless, jobs, tmp_path, FACTS, settings, options)
+    again = run.run_with_events(["pause:9"])
     assert again.workload.chunks == 0 and [facts(r) for r in again.records] == [
         facts(r) for r in done.records[2:]
     ]

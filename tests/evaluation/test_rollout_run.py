@@ -23,12 +23,11 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import (
+    EvaluationRun,
     RunOptions,
     Shard,
     choose_shard,
     default_output,
-    run_episodes,
-    run_with_events,
 )
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -147,14 +146,14 @@ def test_shards_side_by_side_make_the_full_run(
     monkeypatch.setattr(Claims, "take", at_most)
     for index in range(2):
         shard = Shard(index, 2)
-        mine = run_episodes(
+        mine = EvaluationRun(
             policy,
             JOBS[:4],
             tmp_path,
             FACTS,
             settings,
             RunOptions(shard=shard, base=make_moving_env, show_progress=False),
-        )
+        ).run()
         assert len(mine.records) == 2
     assert sorted(path.name for path in find_records([tmp_path])) == [
         "episodes-0of2.jsonl",
@@ -250,9 +249,9 @@ def test_only_the_first_of_several_arms_forecasts_its_time(
     save_records(tmp_path / "earlier", roll(quick_policy("pi05"), JOBS[:1], InlineEnvs()))
     options = RunOptions(base=make_moving_env, times_from=tmp_path / "earlier")
     events = ["pause:4"]
-    run_with_events(
-        quick_policy("pi05"), JOBS[:1], tmp_path / "run", FACTS, settings, events, options
-    )
+    EvaluationRun(
+        quick_policy("pi05"), JOBS[:1], tmp_path / "run", FACTS, settings, options
+    ).run_with_events(events)
     assert capsys.readouterr().err.count("forecast") == 1
 
 

@@ -17,7 +17,7 @@ from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout import evaluation
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
-from mme_vla.evaluation.rollout.evaluation import Evaluation, RunOptions, run_episodes
+from mme_vla.evaluation.rollout.evaluation import Evaluation, EvaluationRun, RunOptions
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog
@@ -75,7 +75,7 @@ class InlineEnvs:
 
 
 def use_inline_envs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `run_episodes` step its environments in this process."""
+    """Let an `EvaluationRun` step its environments in this process."""
 
     def inline(jobs: Any, workers: int, factory: Any, timeout: Any) -> InlineEnvs:
         return InlineEnvs(workers, **factory.keywords)
@@ -109,9 +109,9 @@ def run_evaluation(
     options = RolloutSettings(
         **{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings}
     )
-    return run_episodes(
+    return EvaluationRun(
         policy, jobs, folder, FACTS, options, RunOptions(base=base, show_progress=False)
-    )
+    ).run()
 
 
 def save_records(path: Path, records: Iterable[EpisodeRecord]) -> None:

@@ -16,7 +16,7 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.results.curves import stress_curves
 from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.evaluation import RunOptions, policy_of_split, run_episodes
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, policy_of_split
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import read_arm
 from mme_vla.extras.probing.probed import ProbedEpisode, ProbedPolicy, with_sessions
@@ -52,7 +52,7 @@ def test_nobody_evaluates_such_a_split_without_showing_them(tmp_path: Path) -> N
     policy = quick_policy("framesamp_modul").eval()
     with pytest.raises(UserError, match="2 unrelated episodes come before each, and 0 are shown"):
         options = RunOptions(base=make_moving_env)
-        run_episodes(policy, JOBS, tmp_path, FACTS, RolloutSettings(split=SPLIT), options)
+        EvaluationRun(policy, JOBS, tmp_path, FACTS, RolloutSettings(split=SPLIT), options).run()
     with pytest.raises(UserError, match="2 unrelated episodes come before each, and 0 are shown"):
         make_env("StopCube", SPLIT)
     with pytest.raises(UserError, match="2 recorded episodes to take from, and there are 1"):

@@ -25,7 +25,7 @@ from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import read_receipt
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import RunOptions, facts_of, run_episodes
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import read_records
 from mme_vla.policy.base import Policy
@@ -60,7 +60,7 @@ def run(policy: Policy, folder: Path, jobs: list[Job], **settings: Any) -> list[
     options = RolloutSettings(**{"max_steps": 40, "workers": 1, "max_batch": 1, **settings})
     facts = facts_of(policy, None, None, options, None)
     evaluation = RunOptions(base=make_moving_env, show_progress=False)
-    run_episodes(policy, jobs, folder, facts, options, evaluation)
+    EvaluationRun(policy, jobs, folder, facts, options, evaluation).run()
     return read_records(folder / "episodes.jsonl")
 
 
@@ -333,7 +333,7 @@ def test_a_policy_behind_our_server_has_the_records_of_the_policy_itself(
     options = RolloutSettings(**{"max_steps": 40, "max_batch": 1, **settings})
     named = facts_of(local, None, str(checkpoint), options, None)
     evaluation = RunOptions(base=make_moving_env, source=str(checkpoint), show_progress=False)
-    run_episodes(local, jobs, tmp_path / "local", named, options, evaluation)
+    EvaluationRun(local, jobs, tmp_path / "local", named, options, evaluation).run()
 
     with Served(local, source=str(checkpoint), max_batch=1) as served:
         policy = connect(f"ws://127.0.0.1:{served.server.port}", timeout_s=60)

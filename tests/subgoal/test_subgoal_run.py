@@ -13,7 +13,7 @@ from helpers.rollout_fakes import FACTS, JOBS, quick_policy, records
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_subgoals, report, report_usage
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import predictor_of, run_settings
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, predictor_of, run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.subgoal import BackgroundPredictor, Oracle, Usage, build_predictor
 
@@ -76,12 +76,11 @@ def test_a_model_of_subgoals_is_known_by_the_end_of_its_path() -> None:
 
 
 def test_a_checkpoint_saved_as_text_is_the_same_number(tmp_path: Path) -> None:
-    from mme_vla.evaluation.rollout.evaluation import _done
-
     facts = FACTS.__class__("tiny", "80000", 42)
     record = EpisodeRecord("tiny", 80000, 42, "PickXtimes", 0, 1, "easy", "success", 5)
     (tmp_path / "episodes.jsonl").write_text(record.to_json() + "\n")
-    assert _done(tmp_path, JOBS[:1], facts) == [record]
+    run = EvaluationRun(quick_policy("pi05"), JOBS[:1], tmp_path, facts, RolloutSettings())
+    assert run._records() == [record]
 
 
 def test_subgoals_and_policies_must_go_together(caplog: pytest.LogCaptureFixture) -> None:

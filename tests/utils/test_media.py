@@ -9,7 +9,7 @@ import pytest
 
 from helpers.videos import video_bytes
 from mme_vla.embodiment import ROBOMME_JOINT, Camera
-from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
+from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv
 from mme_vla.evaluation.rollout.video import EpisodeVideo
 from mme_vla.utils.media import (
     BORDER,
@@ -63,7 +63,7 @@ def test_an_episodes_video_shows_every_camera_of_the_robot(
         ThreeCameras, video=EpisodeVideo(lambda outcome, goal: tmp_path / "a.mp4"), robot=robot
     )
     env.reset()
-    env.step(Command(np.zeros((1, 8), np.float32)))
+    env.step(ChunkCommand(np.zeros((1, 8), np.float32)))
     env.close()
     frames = decoded(tmp_path / "a.mp4")
     side = 2 * BORDER

@@ -185,18 +185,18 @@ class VecEnv:
         self.start(worker, job)
         return job
 
-    def start(self, worker: int, job: Job, draw: RenderRequest | None = None) -> None:
+    def start(self, worker: int, job: Job, images: RenderRequest | None = None) -> None:
         """Let a worker begin an episode; its reply carries the first observation.
 
         Args:
-            draw: the images that are requested of the reset, where the environment takes chunks;
+            images: those that are requested of the reset, where the environment takes chunks;
                 by default all.
         """
         state = self._idle(worker)
         state.job = job
         state.resetting = True
         arguments = {"task": job.task, "split": job.split, "episode": job.episode}
-        options = {} if draw is None else {"draw": draw}
+        options = {} if images is None else {"images": images}
         self._command(worker, protocol.RESET, arguments, options)
 
     def send(self, worker: int, action: Any) -> None:
@@ -325,7 +325,7 @@ class VecEnv:
         return self._replace(index, WorkerCrash(f"the worker process {what}"))
 
     def _replace(self, index: int, error: Exception) -> Reply:
-        """Start a new process for a worker; the reply reports the failure of its command."""
+        """Start a new process for a worker, and report the failure of its command."""
         old = self._workers[index]
         old.connection.close()
         protocol.end(old.process)

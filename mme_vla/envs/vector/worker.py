@@ -31,12 +31,9 @@ started.
 
 
 def simulating_processes() -> Any:
-    """The context of `multiprocessing` in which processes that simulate are started.
-
-    They are forked from one process that has only imported the simulator and holds no GPU and no
-    renderer, which saves each of them 5 s of CPU time. Its environment variables may be out of
-    date, so `begin` renews them.
-    """
+    """The context of `multiprocessing` in which processes that simulate are started."""
+    # Forked from one process that has only imported the simulator and holds no GPU and no renderer,
+    # each saves 5 s of CPU time. Its environment variables may be out of date: `begin` renews them.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     return context
@@ -91,9 +88,8 @@ class Slot:
 
 
 def send(connection: Any, *message: Any) -> None:
-    """Send a message as a plain pickle, so that tensors travel by value and not as file
-    descriptors.
-    """
+    """Send a message."""
+    # A plain pickle, so that tensors travel by value and not as file descriptors.
     connection.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
 
 
@@ -160,9 +156,7 @@ def serve(connection: Any, block: Any, factory: Callable[..., Any]) -> None:
 
 
 def _portable(error: Exception) -> Exception:
-    """The error, or a RuntimeError of its text if the reader would have to import its class; its
-    place in a plugin's code is stored with it.
-    """
+    """The error, or a RuntimeError of its text if the reader would have to import its class."""
     place = _plugin_line(error)
     portable: Exception = RuntimeError(f"{type(error).__name__}: {error}")
     if type(error).__module__ in ("builtins", errors.__name__):
@@ -177,9 +171,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def _plugin_line(error: Exception) -> str | None:
-    """File and line of the innermost code of a plugin that an error passed; None where it passed
-    the code of the library and of its packages alone.
-    """
+    """File and line of the innermost code of a plugin that an error passed, if it passed any."""
     place = None
     for frame, line in traceback.walk_tb(error.__traceback__):
         if _is_of_plugin(frame):

@@ -1,9 +1,8 @@
 """The environment's side of a rollout, in a worker process: executes whole chunks and hands back
 every frame.
 
-A worker gets a chunk at a time, so it simulates on while the policy acts in others. Its frames come
-in the form the policy reads. What the benchmark's interface says in dictionaries becomes a `Report`
-here.
+Its frames come in the form the policy reads. What the benchmark's interface says in dictionaries
+becomes a `Report`.
 """
 
 import time
@@ -47,27 +46,25 @@ The robot's `readings`, if it has any, are lists of all frames.
 
 
 def is_out_of_reach(observation: Mapping[str, Any] | None, info: Mapping[str, Any]) -> bool:
-    """Whether an environment's `error` means that no joints or no motion reach what was asked for:
-    the policy failed, not the machine.
-    """
+    """Whether an environment's `error` is of the policy, whose target no motion reaches."""
     return observation == {} or info.get("exception_type") == "PlanningError"
 
 
 @dataclass(frozen=True)
-class Command:
-    """What an environment executes next: actions, or a time for which the robot stays where it is.
+class ChunkCommand:
+    """What an environment executes next.
 
     actions: [n, w], executed one after the other; None with `hold`.
     hold: control steps for which the robot stays where it is.
     subgoal: text in the video meanwhile.
-    draw: the images that are requested, by default all. Frames are counted from the reset on, and
-        the newest is the last.
+    images: those that are requested, by default all. Frames are counted from the reset on, and the
+        newest is the last.
     """
 
     actions: np.ndarray | None = None
     hold: int = 0
     subgoal: str | None = None
-    draw: RenderRequest | None = None
+    images: RenderRequest | None = None
 
 
 @dataclass(frozen=True)
@@ -111,6 +108,27 @@ class Report:
     rendered_s: float = 0.0
 
 
+@dataclass
+class StepOutcome:
+    """What one action led to.
+
+    info: the environment's, with the status of the outcome.
+    executed: 1 for an action, 0 for a hold or an action that failed.
+    frames: that it took.
+    """
+
+    info: Mapping[str, Any]
+    reward: float = 0.0
+    terminated: bool = False
+    truncated: bool = False
+    executed: int = 0
+    frames: int = 0
+
+    @property
+    def ends_episode(self) -> bool:
+        return self.terminated or self.truncated
+
+
 class RenderClock:
     """Adds up what the simulator spends on taking images, where its scene is within reach."""
 
@@ -118,14 +136,12 @@ class RenderClock:
         self.seconds = 0.0
 
     def watch(self, env: Any) -> None:
-        """Time the images of this environment; those of the official package are part of its
-        simulation.
-        """
+        """Time the images of this environment."""
         if isinstance(env, EpisodeEnv):
             env.render_image = self._timed(env.render_image)  # type: ignore[method-assign]
             return
         scene = getattr(getattr(env, "task", None), "scene", None)
-        if scene is None:
+        if scene is None:  # in the official package images are part of the simulation
             return
         scene.update_render = self._timed(scene.update_render)
         for sensor in scene.sensors.values():
@@ -190,12 +206,12 @@ class ChunkEnv:
             self._env = make()
         self._clock.watch(self._env)
 
-    def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, Report]:
+    def reset(self, images: RenderRequest | None = None) -> tuple[Observation, Report]:
         """All frames of the conditioning video, the current one last, and the report.
 
-        draw: the requested images; by default all.
+        images: those that are requested, by default all.
         """
-        self._request_images(draw)
+        self._request_images(images)
         with self._simulation():
             observation, info = self._env.reset()
         frames = Frames(self._robot)
@@ -204,73 +220,75 @@ class ChunkEnv:
         self._note_subgoal(info)
         self._note_goal(info)
         self._add_reset_to_video(frames, count)
-        self._returned = frames.blank_unrequested(draw, 0)
+        self._returned = frames.blank_unrequested(images, 0)
         # Environments of other packages do not know their scene.
         self._scene = getattr(self._env, "scene_digest", NO_VALUES)
         return frames.observation(), self._report(info)
 
-    def step(self, command: Command) -> tuple[Observation, float, bool, bool, Report]:
+    def step(self, command: ChunkCommand) -> tuple[Observation, float, bool, bool, Report]:
         """Execute actions one after the other until they, or the episode, are over.
 
         Returns:
             The frames of the executed actions, the sum of their rewards, terminated, truncated, and
             the report. After `hold` no action counts as executed.
         """
-        actions: list[Any]
-        if command.hold:
-            actions = [Hold(command.hold)]
-            self._max_steps += command.hold
-        else:
+        actions: list[Any] = [Hold(command.hold)]
+        if not command.hold:
             actions = list(np.asarray(command.actions))
+        self._max_steps += command.hold
         frames = Frames(self._robot)
+        outcome = StepOutcome({})
         executed = n_frames = 0
         total_reward = 0.0
-        terminated = truncated = False
-        info: dict[str, Any] = {}
-        draw = command.draw
         for number, action in enumerate(actions, 1):
-            request = draw
-            if draw is not None and number < len(actions):
+            images = command.images
+            if images is not None and number < len(actions):
                 # Only the chunk's last frame is the newest when the policy reads it.
-                request = replace(draw, now=())
-            self._request_images(request)
-            with self._simulation():
-                observation, reward, ended, cut, info = self._env.step(self._command(action))
-            terminated = bool(ended)
-            truncated = bool(cut)
-            total_reward += float(reward)
-            if info.get("status") == "error":
-                terminated = True
-                if is_out_of_reach(observation, info):
-                    info = {**info, "status": "fail"}
+                images = replace(images, now=())
+            self._request_images(images)
+            outcome = self._execute(action, frames, command.subgoal)
+            executed += outcome.executed
+            n_frames += outcome.frames
+            total_reward += outcome.reward
+            if outcome.ends_episode:
                 break
-            if not isinstance(action, Hold):
-                executed += 1
-                self._executed += 1
-            count = frames.add(observation)
-            self._note_pose(observation)
-            self._note_subgoal(info)
-            n_frames += count
-            # A choice that moves nothing takes time too, or it could continue for ever.
-            self._steps += max(count, 1)
-            is_last = self._executed == self._max_actions or self._steps > self._max_steps
-            if is_last and not (terminated or truncated):
-                truncated = True
-                info = {**info, "status": "timeout"}
-            self._note_goal(info)
-            outcome = str(info.get("status")) if terminated or truncated else None
-            self._add_to_video(frames, count, command.subgoal, outcome)
-            if terminated or truncated:
-                break
-        self._returned = frames.blank_unrequested(draw, self._returned)
-        report = replace(self._report(info), executed=executed, frames=n_frames)
+        self._returned = frames.blank_unrequested(command.images, self._returned)
+        report = replace(self._report(outcome.info), executed=executed, frames=n_frames)
         if command.hold:
             report = replace(report, held=self._hold_action())
-        if (terminated or truncated) and self._video is not None:
+        if outcome.ends_episode and self._video is not None:
             path = self._video.finish(str(report.status), report.goal or "")
             if path is not None:
                 report = replace(report, video=path.name)
-        return frames.observation(), total_reward, terminated, truncated, report
+        return frames.observation(), total_reward, outcome.terminated, outcome.truncated, report
+
+    def _execute(
+        self, action: "np.ndarray | Hold", frames: "Frames", subgoal: str | None
+    ) -> StepOutcome:
+        """Execute one action, and add its frames."""
+        with self._simulation():
+            observation, reward, terminated, truncated, info = self._env.step(self._command(action))
+        outcome = StepOutcome(info, float(reward), bool(terminated), bool(truncated))
+        if info.get("status") == "error":
+            outcome.terminated = True
+            if is_out_of_reach(observation, info):
+                outcome.info = {**info, "status": "fail"}
+            return outcome
+        if not isinstance(action, Hold):
+            outcome.executed = 1
+            self._executed += 1
+        outcome.frames = frames.add(observation)
+        self._note_pose(observation)
+        self._note_subgoal(info)
+        # A choice that moves nothing takes time too, or it could continue for ever.
+        self._steps += max(outcome.frames, 1)
+        is_last = self._executed == self._max_actions or self._steps > self._max_steps
+        if is_last and not outcome.ends_episode:
+            outcome.truncated = True
+            outcome.info = {**info, "status": "timeout"}
+        self._note_goal(info)
+        self._add_to_video(frames, outcome, subgoal)
+        return outcome
 
     def close(self) -> None:
         """Free the simulator; an unfinished video is removed."""
@@ -279,7 +297,6 @@ class ChunkEnv:
         self._env.close()
 
     def _command(self, action: "np.ndarray | Hold") -> Any:
-        """What the environment takes for an action [w] of the policy."""
         if isinstance(action, Hold):
             return action
         self._last = action
@@ -301,7 +318,7 @@ class ChunkEnv:
         self._n_subgoals += text != self._subgoal
         self._subgoal = text
 
-    def _note_goal(self, info: dict[str, Any]) -> None:
+    def _note_goal(self, info: Mapping[str, Any]) -> None:
         if goals := info.get("task_goal"):
             self._goal = str(goals[0])
 
@@ -332,7 +349,7 @@ class ChunkEnv:
             self._rendered += render_seconds
             self._simulating += time.perf_counter() - begun - render_seconds
 
-    def _report(self, info: dict[str, Any]) -> Report:
+    def _report(self, info: Mapping[str, Any]) -> Report:
         status = info.get("status")
         self._note_goal(info)
         subtask = self._n_subgoals
@@ -363,7 +380,6 @@ class ChunkEnv:
         return report
 
     def _add_reset_to_video(self, frames: "Frames", count: int) -> None:
-        """Add the conditioning video, and the current frame, to the episode's video."""
         if self._video is None:
             return
         for number, views in enumerate(frames.newest(count), 1):
@@ -372,17 +388,14 @@ class ChunkEnv:
                 caption = "step 0"
             self._video.add(views, self._goal, caption, demo=number < count)
 
-    def _add_to_video(
-        self, frames: "Frames", count: int, subgoal: str | None, outcome: str | None
-    ) -> None:
-        """Add the frames of an action. outcome: of the episode that it ended."""
+    def _add_to_video(self, frames: "Frames", outcome: StepOutcome, subgoal: str | None) -> None:
         if self._video is None:
             return
-        first = self._steps - count + 1
-        for step, views in enumerate(frames.newest(count), first):
+        first = self._steps - outcome.frames + 1
+        for step, views in enumerate(frames.newest(outcome.frames), first):
             parts = [f"step {step}", subgoal]
-            if step == self._steps:
-                parts.append(outcome)
+            if step == self._steps and outcome.ends_episode:
+                parts.append(str(outcome.info.get("status")))
             self._video.add(views, self._goal, " · ".join(part for part in parts if part))
 
 
@@ -411,7 +424,7 @@ class Frames:
         self._states: list[np.ndarray] = []
 
     def add(self, observation: Mapping[str, list[Any]]) -> int:
-        """Take the benchmark's lists; how many frames they hold."""
+        """Take the benchmark's lists; return how many frames they hold."""
         if "state_list" in observation:  # an environment of the user's own
             states = observation["state_list"]
         else:
@@ -447,9 +460,7 @@ class Frames:
         return stop
 
     def newest(self, count: int) -> Iterator[tuple[Any, ...]]:
-        """The last frames before any was left out, each as its images: the robot's cameras, then
-        the benchmark's.
-        """
+        """The last frames, each as its images: the robot's cameras, then the benchmark's."""
         first = len(self._states) - count
         return zip(*(images[first:] for images in self._images.values()), strict=True)
 

@@ -1,23 +1,26 @@
-"""The policy's side of one running episode: its memory, its subgoal, its clock."""
+"""The policy's side of one running episode: its memory, its subgoal, its clock, and the images that
+are rendered for it.
+"""
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
 from mme_vla.embodiment.action_space import read_options
-from mme_vla.envs.scene_hash import NOT_BUILT
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.records import EventEntry, Seconds
+from mme_vla.evaluation.records import Seconds
 from mme_vla.evaluation.rollout.environment import Observation, Report
-from mme_vla.evaluation.rollout.events import Event
+from mme_vla.evaluation.rollout.events import Event, EventCourse
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
-from mme_vla.memory.perturbation import Perturbation
+from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
-from mme_vla.policy.episode import Episode
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
 
 
@@ -27,55 +30,6 @@ def episode_seed(seed: int, task: str, episode: int) -> int:
     """
     digest = hashlib.sha256(f"{seed}/{task}/{episode}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1  # a signed 64-bit integer
-
-
-class EventCourse:
-    """The events of one running episode.
-
-    log: of each its text as `event`, and as `step` the control step at which it acted; None while
-        it has not.
-    hold_steps: control steps for which events held the robot.
-    holding: what holds it, if its frames come next.
-    """
-
-    def __init__(self, events: Sequence[Event]) -> None:
-        self._events = events
-        self.log = [EventEntry(event=event.text, step=None) for event in events]
-        self.hold_steps = 0
-        self.holding: Perturbation | None = None
-
-    def video(self, length: int) -> np.ndarray:
-        """Which of the video's `length` frames are observed, in order, int64 [n]."""
-        real = np.arange(length)
-        for event, entry in zip(self._events, self.log, strict=True):
-            if event.resamples_video and length:
-                real = np.repeat(real, event.perturbation.repeats(len(real), len(real)))
-                entry["step"] = 0
-        return real
-
-    def next(self, episode: Episode, step: int, subtask: int) -> None:
-        """Let events take place that are due at this decision, up to one that holds the robot,
-        which is then `holding`.
-
-        Args:
-            step: control steps so far.
-            subtask: number of the current sub-task, 0 where the environment has none.
-        """
-        self.holding = None
-        for event, entry in zip(self._events, self.log, strict=True):
-            if entry["step"] is not None or event.resamples_video:
-                continue
-            if event.unit == "subtask" and not subtask:
-                raise UserError(
-                    f"event={event.text}: this environment reports no sub-tasks; place it by"
-                    " @step:<n>."
-                )
-            if event.reached(step - self.hold_steps, subtask):
-                entry["step"] = step - self.hold_steps
-                event.perturbation.act(episode)
-                if event.perturbation.hold:
-                    self.holding = event.perturbation
-                    return
 
 
 def select_frames(frames: Observation, numbers: np.ndarray) -> Observation:
@@ -90,12 +44,9 @@ def select_frames(frames: Observation, numbers: np.ndarray) -> Observation:
 class RunningEpisode:
     """One episode between its first observation and its end.
 
-    In a round `begin` or `resume` takes the frames, `read` has the policy observe them,
+    In a round `begin` or `resume` takes the frames, `read` has the policy observe a piece of them,
     `set_subgoal` and `set_actions` take what was decided, and the environment executes it. `end`
     counts the last actions.
-
-    Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of
-    a conditioning video do not keep other episodes waiting.
 
     subgoals: predicts the subgoal.
     piece: frames to a piece.
@@ -126,13 +77,10 @@ class RunningEpisode:
         self.worker = -1
         self.steps = self.chunks = 0
         self.video_frames = 0
-        self.scene = NOT_BUILT
-        """Digest of the scene, once it is built."""
         self.report = Report()
         """The environment's last one."""
         self.process: dict[str, Any] | None = None
         """Where the chain of sub-tasks broke, once the episode is over and if it is reported."""
-        self.video: str | None = None
         self.first_video_frames: int | None = None
         """Frames of the conditioning video, once it is being simulated again for its images."""
         self._actions = hashlib.sha256()
@@ -148,9 +96,8 @@ class RunningEpisode:
     # Observe: frames arrive, and are read piece by piece
 
     def take_report(self, report: Report) -> None:
-        """Note what the environment says: its time, its scene, and what there is to choose."""
+        """Note what the environment says."""
         self.report = report
-        self.scene = report.scene
         self._sim += report.simulated_s
         self._render += report.rendered_s
         # Which options are possible may change after each choice.
@@ -158,8 +105,7 @@ class RunningEpisode:
             self.episode.options = read_options(report.options, len(self._robot.action.choice))
 
     def begin(self, frames: Observation) -> None:
-        """Take the first observation: a conditioning video, if the task has one, and the current
-        frame.
+        """Take the conditioning video, if the task has one, and the current frame.
 
         Raises:
             UserError: the environment names no goal.
@@ -182,9 +128,7 @@ class RunningEpisode:
         self._queue(frames, np.arange(self.video_frames + 1) < self.video_frames, None)
 
     def resume(self, frames: Observation) -> None:
-        """Take the frames that the executed actions led to: one each, unless an action is a motion
-        of many.
-        """
+        """Take the frames that the executed actions led to."""
         self._count_executed()
         length = len(frames["state"])
         has_one_a_frame = self._robot.action.frames is not None
@@ -209,12 +153,12 @@ class RunningEpisode:
         self._queue(frames, np.zeros(n_frames, bool), leading)
 
     def _note_observed(self, length: int, observed: np.ndarray) -> None:
-        """Note which of the environment's next `length` frames the policy observes, int64 [n]."""
+        """Note which of the next `length` frames the policy observes, int64 [n]."""
         self._visible = np.concatenate([self._visible, self._simulated + observed])
         self._simulated += length
 
     def _queue(self, frames: Observation, demo: np.ndarray, leading: np.ndarray | None) -> None:
-        """Have these frames wait to be read; `leading` are the actions that led to them."""
+        """Have frames wait to be read, with the actions that led to them."""
         if len(frames["state"]) != len(demo):
             raise UserError(
                 f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
@@ -282,7 +226,7 @@ class RunningEpisode:
     # Decide and act
 
     def set_subgoal(self, subgoal: Subgoal, latency_s: float) -> None:
-        """Take the subgoal of the current frame, which came after so many seconds."""
+        """Take the subgoal of the current frame."""
         self.episode.subgoal = subgoal.text
         if self.trace is not None:
             self.trace.add(self.watched, subgoal, latency_s)
@@ -299,7 +243,6 @@ class RunningEpisode:
     # Record
 
     def _count_executed(self) -> None:
-        """Count the actions of the last command, for the record."""
         executed = self._sent[: self.report.executed]
         self.steps += self.report.frames
         self._actions.update(np.ascontiguousarray(executed, np.float32).tobytes())
@@ -308,7 +251,6 @@ class RunningEpisode:
         """Count the last actions; their frames are not needed any more."""
         self._count_executed()
         self.process = self.report.process
-        self.video = self.report.video
 
     @property
     def unobserved(self) -> int:
@@ -328,7 +270,117 @@ class RunningEpisode:
 
     @property
     def actions_sha256(self) -> str:
-        """A digest of all executed actions: equal for two runs exactly if they did the same to the
-        last bit.
-        """
+        """A digest of all executed actions, to the last bit."""
         return self._actions.hexdigest()[:16]
+
+
+EVERY = range(2**31)  # Whatever frames there are
+LONGEST_MOTION = 500  # frames by which the last motion of an episode may exceed its step limit
+LONGEST_VIDEO = 2_000  # frames; what is missing of a longer one is rendered by a second reset
+
+
+class RenderPlan:
+    """The images to render for each command to an environment: those that the policy and its
+    predictor read; None requests everything.
+
+    When a policy acts, and so what its memory reads, is known before the episode, but for the
+    length of the conditioning video. Where images of it turn out to be needed, the episode begins
+    once more, and the same simulation then renders them.
+
+    policy, subgoals: the readers.
+    settings: how often the policy acts, and whether all is rendered (`draw`).
+    """
+
+    def __init__(
+        self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings
+    ) -> None:
+        self._policy = policy
+        self._robot = policy.embodiment
+        self._settings = settings
+        self._grounded = subgoals is not None and subgoals.kind == "grounded"
+        self._sees_video = subgoals is not None and subgoals.sees_video
+        self._sees_passing = subgoals is not None and subgoals.sees_passing
+        self._resampled = any(event.resamples_video for event in settings.events)
+        memory = policy.memory
+        every = memory is not None and memory.past_view_spec is not None
+        self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
+        self._reads = cache(self._reads_of)
+        # Depth and poses of cameras come with every frame.
+        self._all = settings.draw == "all" or bool(self._robot.readings) or self._reads(0) is None
+
+    def before_video(self) -> RenderRequest | None:
+        """For a reset, before it is known how long the video is."""
+        if self._all:
+            return None
+        if self._sees_video or self._resampled:
+            return self._render_request(EVERY)
+        return self._render_request(self._read_of_videos)
+
+    def missing(self, frames: Observation) -> RenderRequest | None:
+        """For a second reset, if one that gave these frames left out some that are needed."""
+        if self._all or self._resampled:
+            return None
+        video = len(frames["state"]) - 1
+        needed = range(video) if self._sees_video else self._within(video, 0, video)
+        if all(frames[self._robot.memory_camera][frame] is not None for frame in needed):
+            return None
+        return self._render_request(frozenset(needed))
+
+    def of_chunk(
+        self, running: RunningEpisode, count: int, unobserved: int = 0
+    ) -> RenderRequest | None:
+        """For the next `count` frames of an episode, after so many further ones that are not
+        observed.
+        """
+        if self._all:
+            return None
+        if self._sees_passing:
+            return self._render_request(EVERY)
+        first = running.episode.n_observed_frames
+        stop = EVERY.stop  # of a motion it is not known how many frames it takes
+        if self._robot.action.frames is not None:
+            stop = first + count
+        observed = self._within(running.video_frames, first, stop)
+        # The environment counts the frames that events withheld as well.
+        withheld = running.unobserved + unobserved
+        return self._render_request(frozenset(frame + withheld for frame in observed))
+
+    def _render_request(self, frames: Container[int]) -> RenderRequest:
+        return RenderRequest(
+            dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded
+        )
+
+    def _within(self, exec_start: int, first: int, stop: int) -> list[int]:
+        reads = self._reads(exec_start)
+        assert reads is not None
+        frames: list[int] = reads[(reads >= first) & (reads < stop)].tolist()
+        return frames
+
+    @cached_property
+    def _read_of_videos(self) -> Container[int]:
+        """Frames that the policy may read of any video; none where that may be most of them."""
+        read = self._read_before(np.arange(LONGEST_VIDEO), LONGEST_VIDEO)
+        if read is None or len(read) >= LONGEST_VIDEO / 2:
+            return frozenset()
+        return frozenset(read.tolist())
+
+    def _read_before(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """Frames that the policy reads at any of these steps, beside the current one."""
+        lists = []
+        for step in steps:
+            read = self._policy.frames_read(np.array([step]), exec_start)
+            if read is None:
+                return None
+            lists.append(read[read != step])
+        return union_frames(lists)
+
+    def _reads_of(self, exec_start: int) -> np.ndarray | None:
+        """Frames that the policy reads of an episode with this video, until its step limit."""
+        action = self._robot.action
+        most = self._settings.step_limit + self._settings.hold_steps + 2
+        # A motion, or an event that holds the robot, takes any number of frames: the policy may act
+        # at each.
+        if action.frames is None or self._settings.hold_steps:
+            return self._read_before(exec_start + np.arange(most + LONGEST_MOTION), exec_start)
+        apart = min(self._settings.execute or action.execute, action.horizon)
+        return self._policy.frames_read(exec_start + np.arange(0, most, apart), exec_start)

@@ -1,6 +1,4 @@
-"""A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode
-at once.
-"""
+"""A whole evaluation, from `mme_vla.evaluate` to the records in the run's folder."""
 
 import logging
 import os
@@ -9,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self, Unpack
 
-from mme_vla.config.sections import without
+from mme_vla.config.sections import read_section, without
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
@@ -21,10 +19,10 @@ from mme_vla.errors import UserError, counted, require
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
-from mme_vla.evaluation.rollout.events import read_events
+from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
@@ -37,6 +35,7 @@ from mme_vla.evaluation.store import (
 )
 from mme_vla.policy.base import Policy
 from mme_vla.policy.identity import identify_policy
+from mme_vla.policy.run_folders import locate_checkpoint
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.registry import SPLIT_POLICIES
@@ -45,6 +44,7 @@ from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.utils import remove_drafts, safe_name
 
 logger = logging.getLogger("mme_vla.evaluate")
+VIDEOS = "videos"
 
 
 @dataclass(frozen=True)
@@ -60,50 +60,13 @@ class Shard:
         return RECORDS if self.count == 1 else f"episodes-{self.index}of{self.count}.jsonl"
 
 
-def choose_episodes(
-    tasks: str | Sequence[str] = "all",
-    episodes: Any = None,
-    split: str = "test",
-    env: str = "mme_vla",
-) -> list[Job]:
-    """The episodes of a run, task by task, by the grammar of all commands
-    (`mme_vla.envs.episodes`).
-    """
-    return [
-        Job(spec.task, spec.split, spec.episode)
-        for spec in choose_specs(tasks, episodes, split, env)
-    ]
-
-
-def choose_shard(text: str | None, variables: Mapping[str, str] | None = None) -> Shard:
-    """Read `0/4` (the first of four), or the rank of this process under torchrun.
-
-    text: wins over them.
-    variables: of the environment; None: the process's own.
-    """
-    if variables is None:
-        variables = os.environ
-    if text is None:
-        if "RANK" not in variables or "WORLD_SIZE" not in variables:
-            return Shard()
-        text = f"{variables['RANK']}/{variables['WORLD_SIZE']}"
-    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
-    if match is None or int(match[1]) >= int(match[2]):
-        raise UserError(
-            f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4."
-        )
-    return Shard(int(match[1]), int(match[2]))
-
-
-VIDEOS = "videos"
-
-
 class Evaluation(NamedTuple):
-    """The outcome of a run: the records of its episodes, old and new, and what the policy did this
-    time.
+    """The outcome of a run.
 
-    Of several processes that share a run each has the records that it wrote. output: the run's
-    folder. matched: the records of the plain run, where `records` are of events.
+    records: of its episodes, old and new; of a shard, those that it wrote.
+    workload: what the policy did this time.
+    output: the run's folder.
+    matched: the records of the plain run, where `records` are of events.
     """
 
     records: list[EpisodeRecord]
@@ -148,6 +111,126 @@ class RunOptions:
     name: str | None = None
 
 
+def evaluate(
+    policy: Policy | str | Path,
+    tasks: str | Sequence[str] = "all",
+    episodes: int | Sequence[int] | None = None,
+    *,
+    seed: int = 42,
+    output: str | Path | None = None,
+    subgoal: str | SubgoalPredictor | None = None,
+    name: str | None = None,
+    base: Callable[..., Any] = make_env,
+    show_progress: bool = True,
+    recordings: Any = None,
+    event: str | Sequence[str] | None = None,
+    **settings: Unpack[RolloutKeywords],
+) -> Evaluation:
+    """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
+
+    Workers are processes that import the calling script: keep its work under
+    `if __name__ == "__main__":`. A notebook needs nothing of the kind.
+
+    Args:
+        policy: one with statistics; or what to load one from: a folder, a hub repository, or the
+            name of a shipped one, such as `nano`.
+        tasks, episodes: as `tasks=` and `episodes=` of the command: `"all"` or names; None for all
+            of the split, a number for the first so many, or a list.
+        seed: of the policy's noise.
+        output: the run's folder, by default the one the command would choose.
+        subgoal: a predictor, or the name of one, for policies that read subgoals.
+        name: what records call the policy; its own name by default.
+        base: makes an environment with the benchmark's interface, importable by name.
+        recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
+        event: what happens in every episode, such as `"pause:100@subtask:2"`; of a list each by
+            itself. Every episode runs without it too, in `output` itself.
+        show_progress: whether a progress bar is shown.
+        settings: of `RolloutSettings`, such as `workers=4` or `render=False`.
+
+    Returns:
+        The records of these episodes, and `success_rate`; of those with events, `matched` are the
+        ones without.
+
+    >>> result = evaluate("outputs/framesamp_modul/latest", "StopCube", 5)  # doctest: +SKIP
+    >>> result.success_rate  # doctest: +SKIP
+    0.4
+    """
+    rollout_settings = read_section(RolloutSettings, {**settings, "seed": seed})
+    events = event_arms(event)
+    jobs = choose_episodes(tasks, episodes, rollout_settings.split, rollout_settings.env)
+    if base is make_env:
+        environment(rollout_settings.env).check_installed()
+    loaded, source = load(policy)
+    predictor = predictor_of(loaded, subgoal)
+    label = type(subgoal).__name__ if isinstance(subgoal, SubgoalPredictor) else subgoal
+    options = RunOptions(subgoals=predictor, source=source, base=base, show_progress=show_progress)
+    return evaluate_policy(
+        loaded.eval(),
+        jobs,
+        rollout_settings,
+        events,
+        options,
+        name=name,
+        predictor=label,
+        output=output,
+        recordings=recordings,
+    )
+
+
+def choose_episodes(
+    tasks: str | Sequence[str] = "all",
+    episodes: Any = None,
+    split: str = "test",
+    env: str = "mme_vla",
+) -> list[Job]:
+    """The episodes of a run, task by task."""
+    return [
+        Job(spec.task, spec.split, spec.episode)
+        for spec in choose_specs(tasks, episodes, split, env)
+    ]
+
+
+def choose_shard(text: str | None, variables: Mapping[str, str] | None = None) -> Shard:
+    """Read `0/4` (the first of four), or the rank of this process under torchrun.
+
+    text: wins over them.
+    variables: of the environment; None: the process's own.
+    """
+    if variables is None:
+        variables = os.environ
+    if text is None:
+        if "RANK" not in variables or "WORLD_SIZE" not in variables:
+            return Shard()
+        text = f"{variables['RANK']}/{variables['WORLD_SIZE']}"
+    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
+    if match is None or int(match[1]) >= int(match[2]):
+        raise UserError(
+            f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4."
+        )
+    return Shard(int(match[1]), int(match[2]))
+
+
+def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
+    """A policy, and where its weights are from."""
+    if isinstance(policy, Policy):
+        return policy, None
+    source = locate_checkpoint(policy)
+    return Policy.from_pretrained(source), source
+
+
+def predictor_of(policy: Policy, subgoal: str | SubgoalPredictor | None) -> SubgoalPredictor | None:
+    """A predictor of the kind of subgoals that the policy reads."""
+    if isinstance(subgoal, str):
+        return build_predictor({"name": subgoal, **kind_section(policy)})
+    return subgoal
+
+
+def kind_section(policy: Policy) -> dict[str, str]:
+    """The key `kind` of a predictor's section, where the policy says what it reads."""
+    kind = subgoal_kind(policy)
+    return {} if kind is None else {"kind": kind.removesuffix("_subgoal")}
+
+
 def evaluate_policy(
     policy: Policy,
     jobs: Sequence[Job],
@@ -182,7 +265,55 @@ def evaluate_policy(
     notes = {**(options.notes or {}), "composition": facts.composition}
     policy = policy_of_split(policy, settings.split, recordings)
     options = replace(options, notes=notes)
-    return run_with_events(policy, jobs, folder, facts, settings, events, options)
+    run = EvaluationRun(policy, jobs, folder, facts, settings, options)
+    return run.run_with_events(events)
+
+
+def facts_of(
+    policy: Policy,
+    name: str | None,
+    source: str | None,
+    settings: RolloutSettings,
+    subgoal: str | None,
+) -> RunFacts:
+    """What the records of a run have in common.
+
+    name: of the model; None for the policy's own.
+    source: the checkpoint.
+    subgoal: name of the predictor.
+    """
+    identity = policy.info.identity or identify_policy(policy, name, source)
+    return RunFacts(
+        model=name or identity.model,
+        checkpoint=identity.checkpoint,
+        model_seed=settings.seed,
+        split=settings.split,
+        max_steps=settings.step_limit,
+        subgoal=subgoal,
+        memory_budget=identity.memory_budget,
+        composition=identity.composition,
+        training=identity.training,
+        event=settings.event,
+    )
+
+
+def default_output(facts: RunFacts) -> Path:
+    """A folder that the same command finds again:
+    `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`, or `outputs/evaluation/nano/seed<seed>…`
+    of a shipped policy. A run that earlier versions began under its model's name continues there.
+    """
+    model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
+    if facts.memory_budget is not None:
+        model += f"-{facts.memory_budget}"
+    run = f"seed{facts.model_seed}"
+    if facts.subgoal:
+        run += f"-{facts.subgoal}"
+    if facts.split != "test":
+        run += f"-{re.sub('[:=]', '-', facts.split)}"
+    folder = Path("outputs", "evaluation", model, str(facts.checkpoint), run)
+    if facts.run.is_shipped and not folder.exists():
+        folder = Path("outputs", "evaluation", str(facts.checkpoint), run)
+    return folder
 
 
 def policy_of_split(policy: Policy, split: str, recordings: Any = None) -> Policy:
@@ -202,140 +333,188 @@ def policy_of_split(policy: Policy, split: str, recordings: Any = None) -> Polic
     return policy
 
 
-def run_with_events(
-    policy: Policy,
-    jobs: Sequence[Job],
-    output: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    events: Sequence[str],
-    options: RunOptions = RunOptions(),
-) -> Evaluation:
-    """Run every episode in `output`, then once more under each event, in a folder of its own below.
+@dataclass(frozen=True)
+class EvaluationRun:
+    """A policy in its episodes, and the folder of the records.
 
-    The runs have the same scenes and the same noise, and differ in the event alone. Without events
-    it is `run_episodes`.
-
-    events: arms, such as `pause:100@subtask:2`.
+    policy: in eval mode, on its device, with statistics.
+    jobs: the episodes of the run, of all its processes.
+    folder: one that holds a part of the same run is gone on with.
+    facts: what the records say of the policy.
     """
-    for event in events:
-        for placed in read_events(event):
-            placed.perturbation.check(policy)
-    matched = run_episodes(policy, jobs, output, facts, settings, options)
-    if not events:
-        return matched
-    options = replace(
-        options, times_from=options.times_from or output, show_forecast=False, name=None
-    )
-    records: list[EpisodeRecord] = []
-    for event in events:
-        folder = output / ("event-" + re.sub(r"[^\w.+-]", "-", event))
-        named = replace(facts, event=event)
-        run = run_episodes(policy, jobs, folder, named, replace(settings, event=event), options)
-        records += run.records
-    return Evaluation(records, run.workload, output, matched.records)
 
+    policy: Policy
+    jobs: Sequence[Job]
+    folder: Path
+    facts: RunFacts
+    settings: RolloutSettings
+    options: RunOptions = RunOptions()
 
-def run_episodes(
-    policy: Policy,
-    jobs: Sequence[Job],
-    output: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    options: RunOptions = RunOptions(),
-) -> Evaluation:
-    """Run every episode that `output` has no result of yet.
+    def run_with_events(self, events: Sequence[str]) -> Evaluation:
+        """Run every episode, then once more under each event, with the same scenes and noise, in a
+        folder of its own below.
 
-    Args:
-        policy: in eval mode, on its device, with statistics.
-        jobs: the episodes of the run, of all its processes.
-        output: the run's folder; one that holds a part of the same run is gone on with.
-        facts: what the records say of the policy.
-    """
-    # Everything that can be refused is, before the folder is claimed.
-    policy.require_processor().require_stats()
-    check_subgoals(policy, options.subgoals)
-    check_sessions(settings.split, policy.info.n_distractor_episodes)
-    renders = False
-    if options.base is make_env:
-        environment(settings.env).check_embodiment(policy.embodiment)
-        renders = settings.env == ROBOMME and settings.render
-    decisive = run_settings(policy, facts, settings, options.subgoals, options.source)
-    run = claim_run(output, decisive, options.notes)
+        events: arms, such as `pause:100@subtask:2`.
+        """
+        arms = [self._under(event) for event in events]
+        for arm in arms:
+            for event in arm.settings.events:
+                event.perturbation.check(self.policy)
+        matched = self.run()
+        if not arms:
+            return matched
+        done = [arm.run() for arm in arms]
+        records = [record for arm in done for record in arm.records]
+        return Evaluation(records, done[-1].workload, self.folder, matched.records)
 
-    shard = options.shard
-    workload = Workload()
-    with RecordLog(output / shard.file) as log:
-        remove_drafts(output / VIDEOS)  # videos of workers that were killed
-        # Which episodes are left, the longest first
-        done = _done(output, jobs, facts)
-        finished_keys = finished(done)
-        missing = [job for job in jobs if (job.task, job.episode) not in finished_keys]
-        durations = Durations(earlier_records(output, options.times_from))
-        missing = durations.longest_first(missing)
-        workers = settings.worker_count(-(-len(missing) // shard.count))
-        workers = min(workers, policy.info.max_running or workers)
+    def _under(self, event: str) -> Self:
+        """The same episodes with an event."""
+        options = replace(
+            self.options,
+            times_from=self.options.times_from or self.folder,
+            show_forecast=False,
+            name=None,
+        )
+        return replace(
+            self,
+            folder=self.folder / ("event-" + re.sub(r"[^\w.+-]", "-", event)),
+            facts=replace(self.facts, event=event),
+            settings=replace(self.settings, event=event),
+            options=options,
+        )
 
-        completed = [record for record in done if record.outcome != "error"]
-        name = options.name or facts.run.label
-        with RolloutProgress(len(jobs), completed, options.show_progress, name) as progress:
-            if completed:
-                progress.say(
-                    f"{output} holds {len(completed)} of {counted(len(jobs), 'episode')}:"
-                    " continuing with the others"
-                )
-            forecast = durations.forecast(missing, workers, shard.count)
-            if forecast and options.show_forecast:
-                progress.say(str(forecast))
-            if missing:
-                claims = Claims(output, shard.file) if shard.count > 1 else None
-                folder = output / SUBGOALS if settings.subgoal_log else None
-                with (
-                    _environments(policy, output, facts, settings, options.base, workers) as envs,
-                    receipt(output / shard.file, policy, run, options.source, renders),
-                ):
-                    rollout = Rollout(
-                        policy,
-                        envs,
-                        facts,
-                        settings,
-                        log.append,
-                        options.subgoals,
-                        folder,
-                        progress,
-                        workload,
+    def run(self) -> Evaluation:
+        """Run every episode that the folder has no result of yet, the longest first."""
+        self._check()
+        options = self.options
+        decisive = run_settings(
+            self.policy, self.facts, self.settings, options.subgoals, options.source
+        )
+        content = claim_run(self.folder, decisive, options.notes)
+        workload = Workload()
+        with RecordLog(self.folder / options.shard.file) as log:
+            remove_drafts(self.folder / VIDEOS)  # videos of workers that were killed
+            done = self._records()
+            finished_keys = finished(done)
+            missing = [job for job in self.jobs if (job.task, job.episode) not in finished_keys]
+            durations = Durations(earlier_records(self.folder, options.times_from))
+            missing = durations.longest_first(missing)
+            workers = self.settings.worker_count(-(-len(missing) // options.shard.count))
+            workers = min(workers, self.policy.info.max_running or workers)
+
+            completed = [record for record in done if record.outcome != "error"]
+            name = options.name or self.facts.run.label
+            with RolloutProgress(
+                len(self.jobs), completed, options.show_progress, name
+            ) as progress:
+                if completed:
+                    progress.say(
+                        f"{self.folder} holds {len(completed)} of"
+                        f" {counted(len(self.jobs), 'episode')}: continuing with the others"
                     )
-                    rollout.run(Waiting(missing, claims))
-    return Evaluation(_done(output, jobs, facts, shard), workload, output)
+                forecast = durations.forecast(missing, workers, options.shard.count)
+                if forecast and options.show_forecast:
+                    progress.say(str(forecast))
+                if missing:
+                    workload = self._roll_out(missing, workers, content, log, progress)
+        return Evaluation(self._records(options.shard), workload, self.folder)
+
+    def _check(self) -> None:
+        """Refuse what can be refused, before the folder is claimed."""
+        self.policy.require_processor().require_stats()
+        check_subgoals(self.policy, self.options.subgoals)
+        check_sessions(self.settings.split, self.policy.info.n_distractor_episodes)
+        if self.options.base is make_env:
+            environment(self.settings.env).check_embodiment(self.policy.embodiment)
+
+    def _records(self, shard: Shard = Shard()) -> list[EpisodeRecord]:
+        """The folder's records of these episodes; of one of several shards, only its own file's."""
+        keys = {(job.task, job.episode) for job in self.jobs}
+        files = sorted(self.folder.glob("episodes*.jsonl"))
+        if shard.count > 1:
+            files = [self.folder / shard.file]
+        records = []
+        for path in files:
+            for record in read_records(path):
+                # run.json has seen to it that this is the same policy: records from before there
+                # were digests are of it too.
+                if record.composition is None:
+                    record = replace(record, composition=self.facts.composition)
+                records.append(record)
+        merged = merge(records, "first")
+        return [record for record in merged if record.run == self.facts.run and record.key in keys]
+
+    def _roll_out(
+        self,
+        missing: Sequence[Job],
+        workers: int,
+        content: Mapping[str, Any],
+        log: RecordLog,
+        progress: RolloutProgress,
+    ) -> Workload:
+        """Run these episodes in worker processes. content: of `run.json`, for the receipt."""
+        options, settings = self.options, self.settings
+        claims = Claims(self.folder, log.path.name) if options.shard.count > 1 else None
+        renders = options.base is make_env and settings.env == ROBOMME and settings.render
+        with (
+            self._environments(workers) as envs,
+            receipt(log.path, self.policy, content, options.source, renders),
+        ):
+            rollout = Rollout(
+                self.policy,
+                envs,
+                self.facts,
+                settings,
+                log.append,
+                options.subgoals,
+                self.folder / SUBGOALS if settings.subgoal_log else None,
+                progress,
+            )
+            rollout.run(Waiting(missing, claims))
+        return rollout.workload
+
+    def _environments(self, workers: int) -> VecEnv:
+        settings = self.settings
+        info = self.policy.info
+        base = self.options.base
+        sessions = 0
+        if base is make_env:
+            base = base_env(
+                settings.env,
+                self.policy.embodiment,
+                settings.render,
+                only_possible=settings.only_possible,
+            )
+            sessions = info.n_distractor_episodes
+        videos = None
+        if settings.video != "none":
+            videos = (str(self.folder / VIDEOS), settings.video)
+        make = partial(
+            make_rollout_env,
+            base=base,
+            max_steps=settings.limit_of,
+            videos=videos,
+            run=self.facts.run.label,
+            robot=self.policy.embodiment,
+            max_actions=settings.max_actions or info.max_actions,
+            sessions=sessions,
+        )
+        return VecEnv([], workers, make, settings.timeout_s)
 
 
-def _environments(
-    policy: Policy,
-    output: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    base: Callable[..., Any],
-    workers: int,
-) -> VecEnv:
-    robot = policy.embodiment
-    sessions = 0
-    if base is make_env:
-        base = base_env(settings.env, robot, settings.render, only_possible=settings.only_possible)
-        sessions = policy.info.n_distractor_episodes
-    videos = None
-    if settings.video != "none":
-        videos = (str(output / VIDEOS), settings.video)
-    make = partial(
-        make_rollout_env,
-        base=base,
-        max_steps=settings.limit_of,
-        videos=videos,
-        run=facts.run.label,
-        robot=robot,
-        max_actions=settings.max_actions or policy.info.max_actions,
-        sessions=sessions,
-    )
-    return VecEnv([], workers, make, settings.timeout_s)
+def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
+    """Refuse a predictor whose subgoals this policy was not trained to read."""
+    if subgoals is None:
+        return
+    if not policy.require_processor().prompt_spec.reads_subgoal:
+        name = PolicySections.of(policy.config).name or "The policy"
+        raise UserError(f"{name} reads no subgoal: leave out subgoal=….")
+    kind = subgoal_kind(policy)
+    if kind is not None and kind != f"{subgoals.kind}_subgoal":
+        expected = kind.removesuffix("_subgoal")
+        raise UserError(
+            f"The policy was trained with {expected} subgoals: set subgoal.kind={expected}."
+        )
 
 
 def run_settings(
@@ -386,106 +565,5 @@ def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, 
 
 
 def _end_of(place: str | None) -> str | None:
-    """The end of a path alone: machines that share a run may have the folder at
-    different places.
-    """
+    # Machines that share a run may have the folder at different places.
     return None if place is None else "/".join(Path(place).parts[-4:])
-
-
-def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
-    """Refuse a predictor whose subgoals this policy was not trained to read."""
-    if subgoals is None:
-        return
-    if not policy.require_processor().prompt_spec.reads_subgoal:
-        name = PolicySections.of(policy.config).name or "The policy"
-        raise UserError(f"{name} reads no subgoal: leave out subgoal=….")
-    kind = subgoal_kind(policy)
-    if kind is not None and kind != f"{subgoals.kind}_subgoal":
-        expected = kind.removesuffix("_subgoal")
-        raise UserError(
-            f"The policy was trained with {expected} subgoals: set subgoal.kind={expected}."
-        )
-
-
-def kind_section(policy: Policy) -> dict[str, str]:
-    """The key `kind` of a predictor's section: what the policy was trained to read. Empty where it
-    does not say.
-    """
-    kind = subgoal_kind(policy)
-    return {} if kind is None else {"kind": kind.removesuffix("_subgoal")}
-
-
-def predictor_of(policy: Policy, subgoal: str | SubgoalPredictor | None) -> SubgoalPredictor | None:
-    """A predictor by its name, of the kind of subgoals that the policy reads; one that is given
-    stays as it is.
-    """
-    if isinstance(subgoal, str):
-        return build_predictor({"name": subgoal, **kind_section(policy)})
-    return subgoal
-
-
-def facts_of(
-    policy: Policy,
-    name: str | None,
-    source: str | None,
-    settings: RolloutSettings,
-    subgoal: str | None,
-) -> RunFacts:
-    """What the records of a run have in common.
-
-    name: of the model; None for the policy's own.
-    source: the checkpoint.
-    subgoal: name of the predictor.
-    """
-    identity = policy.info.identity or identify_policy(policy, name, source)
-    return RunFacts(
-        model=name or identity.model,
-        checkpoint=identity.checkpoint,
-        model_seed=settings.seed,
-        split=settings.split,
-        max_steps=settings.step_limit,
-        subgoal=subgoal,
-        memory_budget=identity.memory_budget,
-        composition=identity.composition,
-        training=identity.training,
-        event=settings.event,
-    )
-
-
-def default_output(facts: RunFacts) -> Path:
-    """A folder that the same command finds again:
-    `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`, or `outputs/evaluation/nano/seed<seed>…`
-    of a shipped policy. A run that earlier versions began under its model's name continues there.
-    """
-    model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
-    if facts.memory_budget is not None:
-        model += f"-{facts.memory_budget}"
-    run = f"seed{facts.model_seed}"
-    if facts.subgoal:
-        run += f"-{facts.subgoal}"
-    if facts.split != "test":
-        run += f"-{re.sub('[:=]', '-', facts.split)}"
-    folder = Path("outputs", "evaluation", model, str(facts.checkpoint), run)
-    if facts.run.is_shipped and not folder.exists():
-        folder = Path("outputs", "evaluation", str(facts.checkpoint), run)
-    return folder
-
-
-def _done(
-    output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | None = None
-) -> list[EpisodeRecord]:
-    """The folder's records of these episodes; with a shard, only those of its own file."""
-    keys = {(job.task, job.episode) for job in jobs}
-    files = sorted(output.glob("episodes*.jsonl"))
-    if shard is not None and shard.count > 1:
-        files = [output / shard.file]
-    records = []
-    for path in files:
-        for record in read_records(path):
-            # run.json has seen to it that this is the same policy: records from before there were
-            # digests are of it too.
-            if record.composition is None:
-                record = replace(record, composition=facts.composition)
-            records.append(record)
-    merged = merge(records, "first")
-    return [record for record in merged if record.run == facts.run and record.key in keys]

@@ -1,9 +1,12 @@
 """The events of an episode, as the key `event` names them: what happens, and where."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from mme_vla.errors import UserError, brief, check_choice, require
+from mme_vla.evaluation.records import EventEntry
 from mme_vla.memory.perturbation import (
     ROLLOUT,
     Perturbation,
@@ -11,6 +14,9 @@ from mme_vla.memory.perturbation import (
     overrides,
     split_word,
 )
+
+if TYPE_CHECKING:
+    from mme_vla.policy.episode import Episode
 
 FORM = "write pause:100, pause:100@step:64 or pause:100@subtask:2; + joins several of one episode"
 
@@ -83,3 +89,50 @@ def event_arms(value: Any) -> list[str]:
     for arm in arms:
         read_events(arm)
     return list(arms)
+
+
+class EventCourse:
+    """The events of one running episode.
+
+    log: each event, and when it acted.
+    hold_steps: control steps for which events held the robot.
+    holding: what holds it, if its frames come next.
+    """
+
+    def __init__(self, events: Sequence[Event]) -> None:
+        self._events = events
+        self.log = [EventEntry(event=event.text, step=None) for event in events]
+        self.hold_steps = 0
+        self.holding: Perturbation | None = None
+
+    def video(self, length: int) -> np.ndarray:
+        """Which of the video's `length` frames are observed, in order, int64 [n]."""
+        real = np.arange(length)
+        for event, entry in zip(self._events, self.log, strict=True):
+            if event.resamples_video and length:
+                real = np.repeat(real, event.perturbation.repeats(len(real), len(real)))
+                entry["step"] = 0
+        return real
+
+    def next(self, episode: "Episode", step: int, subtask: int) -> None:
+        """Let events take place that are due, up to one that holds the robot.
+
+        Args:
+            step: control steps so far.
+            subtask: number of the current sub-task, 0 where the environment has none.
+        """
+        self.holding = None
+        for event, entry in zip(self._events, self.log, strict=True):
+            if entry["step"] is not None or event.resamples_video:
+                continue
+            if event.unit == "subtask" and not subtask:
+                raise UserError(
+                    f"event={event.text}: this environment reports no sub-tasks; place it by"
+                    " @step:<n>."
+                )
+            if event.reached(step - self.hold_steps, subtask):
+                entry["step"] = step - self.hold_steps
+                event.perturbation.act(episode)
+                if event.perturbation.hold:
+                    self.holding = event.perturbation
+                    return

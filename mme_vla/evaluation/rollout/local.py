@@ -28,14 +28,14 @@ class LocalEnvs:
         """Whether a reply is waiting."""
         return bool(self._replies)
 
-    def start(self, worker: int, job: Job, draw: RenderRequest | None = None) -> None:
-        """Begin an episode; `draw` are the requested images, by default all."""
+    def start(self, worker: int, job: Job, images: RenderRequest | None = None) -> None:
+        """Begin an episode."""
         self._close()
         self._job = job
 
         def begin() -> Any:
             self._env = self._make(task=job.task, split=job.split, episode=job.episode)
-            return self._env.reset(draw)
+            return self._env.reset(images)
 
         self._run(worker, True, begin)
 

@@ -1,8 +1,7 @@
 """Many episodes at once: environments in worker processes, one policy that acts for the waiting
 ones in one batch.
 
-Each worker executes its chunk at its own pace. One that has finished is in the policy's next batch.
-No episode waits for a slow one, and a long conditioning video is read in pieces between batches.
+Each worker executes its chunk at its own pace, and joins the policy's next batch when it is done.
 """
 
 import time
@@ -19,16 +18,14 @@ from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError, place_of, text_of
-from mme_vla.evaluation.records import EpisodeRecord, RunKey, checkpoint_number
-from mme_vla.evaluation.rollout.environment import Command
-from mme_vla.evaluation.rollout.episode import RunningEpisode
-from mme_vla.evaluation.rollout.events import read_events
+from mme_vla.evaluation.records import EpisodeRecord, OfRun
+from mme_vla.evaluation.rollout.environment import ChunkCommand
+from mme_vla.evaluation.rollout.episode import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
-from mme_vla.policy.base import Policy
+from mme_vla.policy.base import Policy, frames_a_piece
 from mme_vla.policy.episode import Failure
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.policy.training_identity import TrainingIdentity
@@ -76,13 +73,13 @@ class Environments(Protocol):
     def workers(self) -> int: ...
     @property
     def busy(self) -> bool: ...
-    def start(self, worker: int, job: Job, draw: RenderRequest | None = None) -> None: ...
+    def start(self, worker: int, job: Job, images: RenderRequest | None = None) -> None: ...
     def send(self, worker: int, action: object) -> None: ...
     def recv(self, timeout: float | None = None) -> list[Reply]: ...
 
 
 @dataclass(frozen=True)
-class RunFacts:
+class RunFacts(OfRun):
     """What all records of a run have in common; the fields are those of `EpisodeRecord`."""
 
     model: str
@@ -95,21 +92,6 @@ class RunFacts:
     composition: str | None = None
     training: TrainingIdentity | None = None
     event: str | None = None
-
-    @property
-    def run(self) -> RunKey:
-        """The run that its records are of."""
-        return RunKey(
-            model=self.model,
-            subgoal=self.subgoal,
-            memory_budget=self.memory_budget,
-            checkpoint=checkpoint_number(self.checkpoint),
-            model_seed=self.model_seed,
-            split=self.split,
-            composition=self.composition,
-            training=self.training,
-            event=self.event,
-        )
 
 
 @dataclass
@@ -157,7 +139,6 @@ class Rollout:
         subgoals: SubgoalPredictor | None = None,
         subgoal_folder: Path | None = None,
         progress: RolloutProgress | None = None,
-        workload: Workload | None = None,
     ) -> None:
         """Prepare a rollout; `run` does it.
 
@@ -167,10 +148,9 @@ class Rollout:
             facts: what the records say of the policy.
             record: called with every record, as soon as there is one.
             subgoals: predicts the subgoal; None leaves it out of the prompt.
-            subgoal_folder: where every subgoal is written down with its image; None keeps the
-                scores alone.
+            subgoal_folder: where every subgoal is logged with its image; None keeps the scores
+                alone.
             progress: is told of every record.
-            workload: counts what the policy does.
         """
         self.policy = policy
         self.envs = envs
@@ -180,7 +160,7 @@ class Rollout:
         self.subgoals = subgoals
         self.subgoal_folder = subgoal_folder
         self.progress = progress or RolloutProgress(0, visible=False)
-        self.workload = workload or Workload()
+        self.workload = Workload()
         self._waiting = Waiting()
         self._running: dict[int, RunningEpisode] = {}  # by worker
         self._tries: Counter[Job] = Counter()
@@ -191,7 +171,7 @@ class Rollout:
         self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(
             settings.max_batch
         )
-        self._events = read_events(settings.event)
+        self._events = settings.events
         self._render_plan = RenderPlan(policy, subgoals, settings)
 
     # What a subclass may override -----------------------------------------------------------------
@@ -217,9 +197,7 @@ class Rollout:
             pass
 
     def rounds(self, jobs: Sequence[Job] | Waiting) -> Iterator[None]:
-        """Run these episodes; yields whenever the policy has done what it could for those that
-        wait.
-        """
+        """Run these episodes; yields after each turn of the policy."""
         begun = time.perf_counter()
         if not isinstance(jobs, Waiting):
             jobs = Waiting(jobs)
@@ -240,9 +218,7 @@ class Rollout:
         if job is None:
             return
         self._tries[job] += 1
-        piece = self.settings.encode_chunk
-        if self.policy.memory is not None:  # of some memories most frames are never encoded
-            piece *= self.policy.memory.storage.keep_every
+        piece = frames_a_piece(self.policy, self.settings.encode_chunk)
         trace = None
         if self.subgoals is not None:
             trace = SubgoalTrace(
@@ -253,10 +229,9 @@ class Rollout:
         )
         running.worker = worker
         self._running[worker] = running
-        self.envs.start(worker, job, draw=self._render_plan.before_video())
+        self.envs.start(worker, job, images=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
-        """Deal with what came back from a worker."""
         running = self._running[reply.worker]
         self._scheduler.later.pop(running, None)
         self.on_reply(running, reply)
@@ -282,7 +257,7 @@ class Rollout:
             message = running.report.error
         else:
             status = "error"
-            message = f"{reply.job}: {text_of(reply.error)}"
+            message = reply.info["error_message"]
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
         # A scene in which an object finds no place finds none again, and says nothing of the
@@ -299,13 +274,11 @@ class Rollout:
         self._finish(running, status, message, retry=not is_unbuildable)
 
     def _check_same_error(self, running: RunningEpisode, reply: Reply) -> None:
-        """Stop if the environment's own code failed twice in the same way: it will again.
-
-        Episodes that are tried again do not count, as all that failed for rare reasons meet there.
-        """
+        """Stop if the environment's own code failed twice in the same way: it will again."""
         if reply.error is None:
             self._same_errors = 0
             return
+        # In episodes that are tried again, all that failed for rare reasons meet.
         if place_of(reply.error) is None or self._tries[running.job] > 1:
             return
         text = text_of(reply.error)
@@ -333,7 +306,7 @@ class Rollout:
         if missing is None:
             return False
         running.first_video_frames = length
-        self.envs.start(running.worker, running.job, draw=missing)
+        self.envs.start(running.worker, running.job, images=missing)
         return True
 
     def _run_scheduler(self) -> None:
@@ -351,14 +324,14 @@ class Rollout:
         self.workload.policy_s += time.perf_counter() - begun
 
     def _proceed(self, running: RunningEpisode) -> None:
-        """Have the policy act, unless an event holds the robot first; every frame is read."""
+        """Have the policy act, unless an event holds the robot first."""
         running.events.next(running.episode, running.steps, running.report.subtask)
         event = running.events.holding
         if event is None:
             self._scheduler.acting.append(running)
             return
-        draw = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
-        command = Command(hold=event.hold, subgoal=running.episode.subgoal, draw=draw)
+        images = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
+        command = ChunkCommand(hold=event.hold, subgoal=running.episode.subgoal, images=images)
         self.envs.send(running.worker, command)
 
     def _act(self, batch: list[RunningEpisode]) -> None:
@@ -386,17 +359,13 @@ class Rollout:
                 )
                 continue
             running.set_actions(actions)
-            draw = self._render_plan.of_chunk(running, len(actions))
-            command = Command(actions, subgoal=running.episode.subgoal, draw=draw)
+            images = self._render_plan.of_chunk(running, len(actions))
+            command = ChunkCommand(actions, subgoal=running.episode.subgoal, images=images)
             self.envs.send(running.worker, command)
             self._scheduler.later[running] = None
 
     def _give_up(self, running: RunningEpisode, failure: Failure) -> None:
-        """End an episode in which the policy cannot act any more.
-
-        Raises:
-            UserError: it chose no chunk in many episodes in a row.
-        """
+        """End an episode in which the policy cannot act any more."""
         if not running.chunks:
             self._inactive += 1
         if self._inactive >= GIVE_UP_AFTER:
@@ -409,17 +378,14 @@ class Rollout:
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
     ) -> None:
-        """End an episode and let its worker begin another.
-
-        An episode that is tried again leaves a record with the outcome `error`, which the record of
-        the repetition supersedes (`records.merge`).
-        """
+        """End an episode and let its worker begin another."""
         outcome = status
         if status not in ("success", "fail", "timeout"):
             outcome = "error"
             error = error or f"the environment ended the episode with the status {status!r}"
         running.episode.close()
         again = outcome == "error" and retry and self._tries[running.job] <= self.settings.retries
+        # The record of an error is superseded by that of the repetition (`records.merge`).
         self.on_end(running, Ending(outcome, error, again))
         if again:
             self._waiting.put_back(running.job)
@@ -440,7 +406,7 @@ class Rollout:
             episode=job.episode,
             seed=spec.seed,
             difficulty=spec.difficulty,
-            scene=running.scene,
+            scene=running.report.scene,
             outcome=ending.outcome,
             steps=running.steps,
             seconds=running.seconds,
@@ -453,7 +419,7 @@ class Rollout:
             suite=source.suite_of(job.task),
             groups=source.groups_of(job.task) or None,
             refused=None if failed else ending.error,
-            video=running.video,
+            video=running.report.video,
             process=running.process,
             events=tuple(running.events.log),
             subgoals=None if running.trace is None else running.trace.score.to_dict(),

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, TypedDict
 from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
-from mme_vla.evaluation.rollout.events import read_events
+from mme_vla.evaluation.rollout.events import Event, read_events
 from mme_vla.policy.run_folders import check_on_machine, find_run
 
 
@@ -61,13 +61,23 @@ class RolloutSettings:
     def __post_init__(self) -> None:
         source = environment(self.env)
         source.check_split(self.split)
-        if any(event.perturbation.hold for event in read_events(self.event)):
+        if self.hold_steps:
             source.check_hold()
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read the keys of a configuration that are settings; others are ignored."""
         return read_section(cls, config, others=True)
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """What `event` names."""
+        return read_events(self.event)
+
+    @property
+    def hold_steps(self) -> int:
+        """Control steps for which the events of an episode hold the robot."""
+        return sum(event.perturbation.hold for event in self.events)
 
     @property
     def step_limit(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from mme_vla.config.sections import Positive, Range
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
-from mme_vla.evaluation.rollout.evaluation import RunOptions, run_episodes
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.audit.conclusion import (
@@ -143,7 +143,7 @@ def _run_floor(
         RANDOM, "untrained", settings.seed, facts.split, facts.max_steps, event=facts.event
     )
     quiet = replace(options, source=None, name=RANDOM, show_forecast=False)
-    run_episodes(floor, plan.jobs, folder, of_floor, settings, quiet)
+    EvaluationRun(floor, plan.jobs, folder, of_floor, settings, quiet).run()
 
 
 def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:

@@ -25,11 +25,11 @@ from mme_vla.errors import SceneError, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import (
     VIDEOS,
+    EvaluationRun,
     RunOptions,
     choose_shard,
     facts_of,
     predictor_of,
-    run_episodes,
 )
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
@@ -271,7 +271,7 @@ def run_checkpoint(
         facts = replace(facts, model=named(facts.model, arm))
     jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     options = RunOptions(subgoals=subgoals, shard=choose_shard(rules.shard), source=str(checkpoint))
-    return run_episodes(policy, jobs, folder, facts, settings, options).records
+    return EvaluationRun(policy, jobs, folder, facts, settings, options).run().records
 
 
 def evaluate_row(

@@ -23,7 +23,7 @@ from mme_vla.evaluation.results.statistics import (
     sampled_interval,
 )
 from mme_vla.evaluation.results.tables import Table, to_markdown
-from mme_vla.evaluation.rollout.evaluation import RunOptions, run_episodes
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
@@ -215,7 +215,7 @@ def measure_card(
     run_probe(policy, replace(plan, recordings=()), folder, facts, settings, options)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
-    run_episodes(policy, plan.jobs, folder / AGAIN, renamed, again, options)
+    EvaluationRun(policy, plan.jobs, folder / AGAIN, renamed, again, options).run()
 
     # On recorded episodes: how long a wrong scene has an effect.
     recovered = None

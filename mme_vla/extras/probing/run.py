@@ -16,19 +16,18 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, printable, require
-from mme_vla.evaluation.api import load
 from mme_vla.evaluation.records import ARM, EpisodeRecord, display_name
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.events import idle_events
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import (
+    EvaluationRun,
     RunOptions,
     choose_episodes,
     facts_of,
+    load,
     predictor_of,
-    run_episodes,
-    run_with_events,
 )
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -177,11 +176,12 @@ def _in_closed_loop(
             name=f"{display_name(facts.model, facts.checkpoint)}{ARM}{arm.name}",
         )
         if arm is UNPROBED:
-            run_with_events(policy, plan.jobs, output, facts, settings, plan.events, arm_options)
+            run = EvaluationRun(policy, plan.jobs, output, facts, settings, arm_options)
+            run.run_with_events(plan.events)
         else:
             probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
             arm_facts = replace(facts, model=named(facts.model, arm))
-            run_episodes(probed, plan.jobs, output, arm_facts, settings, arm_options)
+            EvaluationRun(probed, plan.jobs, output, arm_facts, settings, arm_options).run()
 
 
 def _on_recordings(

@@ -33,14 +33,13 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, mean_interval
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.environment import (
+    ChunkCommand,
     ChunkEnv,
-    Command,
     base_env,
     make_rollout_env,
 )
-from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.episode import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.evaluation import RunOptions, run_settings
-from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import claim_run
@@ -236,9 +235,9 @@ class TwinScenes:
                 if action is None:
                     raise NoPairError("the demonstrator reaches no decision that depends on a fact")
                 actions.append(action)
-                draw = self._plan.of_chunk(first, 1)
+                images = self._plan.of_chunk(first, 1)
                 frames, _, terminated, truncated, report = env.step(
-                    Command(action[None], draw=draw)
+                    ChunkCommand(action[None], images=images)
                 )
                 if terminated or truncated:
                     raise NoPairError("the demonstrator ends it before a decision")
@@ -270,9 +269,9 @@ class TwinScenes:
         try:
             env.reset(NOTHING)
             for action in decision.actions:
-                env.step(Command(action[None], draw=NOTHING))
+                env.step(ChunkCommand(action[None], images=NOTHING))
             start = base.tool
-            env.step(Command(chunk, draw=NOTHING))
+            env.step(ChunkCommand(chunk, images=NOTHING))
             return share_correct(decision.candidates, start, base.tool)
         finally:
             env.close()

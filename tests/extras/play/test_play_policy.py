@@ -14,7 +14,7 @@ from mme_vla.config.composition import compose
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import RunOptions, facts_of, run_episodes
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import read_records
 from mme_vla.extras.play import cli
@@ -104,7 +104,7 @@ def test_a_served_policy_plays_what_it_chooses_when_it_is_evaluated(tmp_path: Pa
     facts = facts_of(policy, "test", None, settings, None)
     options = RunOptions(base=open_blocks, show_progress=False)
     jobs = [Job("VideoUnmask", "test", episode) for episode in range(2)]
-    run_episodes(policy, jobs, tmp_path / "evaluated", facts, settings, options)
+    EvaluationRun(policy, jobs, tmp_path / "evaluated", facts, settings, options).run()
     assert played == taken()
     assert [len(row) for row in played] == [6, 6]
     assert len({point for row in played for _, point in row}) > 2, "it looks at what it is shown"
@@ -145,7 +145,7 @@ def test_a_policy_plays_for_as_many_steps_as_its_evaluation(
     facts = facts_of(policy, None, str(checkpoint), settings, None)
     options = RunOptions(base=open_blocks, show_progress=False)
     jobs = [Job("VideoUnmask", "test", episode) for episode in range(2)]
-    run_episodes(policy, jobs, tmp_path / "evaluated", facts, settings, options)
+    EvaluationRun(policy, jobs, tmp_path / "evaluated", facts, settings, options).run()
     evaluated = read_records(tmp_path / "evaluated" / "episodes.jsonl")
     assert [record.chunks for record in evaluated] == [
         len(record.extra["decisions"]) for record in played

@@ -315,7 +315,7 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(
         lambda arm, *_, **__: "a camera" if arm.name == "distract:1" else None,
     )
     monkeypatch.setattr(card_module, "run_probe", lambda policy, plan, *_, **__: plans.append(plan))
-    monkeypatch.setattr(card_module, "run_episodes", lambda *_, **__: None)
+    monkeypatch.setattr(card_module.EvaluationRun, "run", lambda run: None)
     ended = {
         EpisodeKey(record.task, record.episode): [record] for record in records("test", [1, 1])
     }

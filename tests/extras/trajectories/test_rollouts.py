@@ -16,7 +16,7 @@ from helpers.scripted_env import ScriptedEnv
 from mme_vla import MMEPolicy, UserError, build_policy, register
 from mme_vla.embodiment.robomme import ROBOMME_JOINT
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
+from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, path_log_prob
 from mme_vla.extras.trajectories.rollouts import ARGUMENTS_INSTEAD, join, rollouts
 from mme_vla.processing.normalise import NormStats
@@ -182,7 +182,7 @@ def test_what_another_argument_sets_is_no_option_of_the_environment(
 def test_the_reward_of_a_chunk_is_the_sum_over_its_actions() -> None:
     env = ChunkEnv(lambda: Rewarding("PickXtimes", 0, 40, 1e9, 0.0, ""), robot=ROBOMME_JOINT)
     env.reset()
-    assert env.step(Command(np.zeros((5, 8))))[1] == 5.0
+    assert env.step(ChunkCommand(np.zeros((5, 8))))[1] == 5.0
 
 
 def test_a_reward_of_your_own_is_registered_by_name() -> None:

@@ -10,7 +10,7 @@ from helpers.depth_env import MOTION, DepthEnv, make_depth_env
 from helpers.rollout_fakes import InlineEnvs, roll
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
+from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv
 from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.build import build_policy
 
@@ -44,7 +44,7 @@ def test_an_episode_ends_after_its_waypoints(policy: SAM2ActPolicy) -> None:
 def test_the_last_frame_of_a_motion_is_the_keyframe(policy: SAM2ActPolicy) -> None:
     env = ChunkEnv(lambda: DepthEnv("PickXtimes", 0), robot=policy.embodiment)
     env.reset()
-    frames, *_ = env.step(Command(np.zeros((1, 7), np.float32)))
+    frames, *_ = env.step(ChunkCommand(np.zeros((1, 7), np.float32)))
     episode = policy.start_episode("pick")
     names = [*policy.embodiment.camera_names, *policy.embodiment.readings]
     views = {name: np.stack(frames[name]) for name in names}
