@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+import mme_vla
 from mme_vla import UserError
 from mme_vla.cli import evaluate
 from mme_vla.config.composition import compose
@@ -202,6 +203,8 @@ def test_a_folder_of_something_else_is_not_filled_with_records(tmp_path: Path) -
     words = ["checkpoint=nano", "tasks=StopCube", f"output={tmp_path / 'foreign'}"]
     with pytest.raises(UserError, match="holds files, but no run"):
         evaluate.main(compose("evaluate", words))
+    with pytest.raises(UserError, match="holds files, but no run"):
+        mme_vla.evaluate("nano", "StopCube", 1, output=tmp_path / "foreign")
 
 
 def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:

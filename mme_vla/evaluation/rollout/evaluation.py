@@ -29,13 +29,14 @@ from mme_vla.evaluation.store import (
     RECORDS,
     Claims,
     RecordLog,
+    check_run_folder,
     claim_run,
     fingerprint,
     read_records,
 )
 from mme_vla.policy.base import Policy
 from mme_vla.policy.identity import identify_policy
-from mme_vla.policy.run_folders import locate_checkpoint
+from mme_vla.policy.run_folders import check_output, locate_checkpoint
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.registry import SPLIT_POLICIES
@@ -156,6 +157,9 @@ def evaluate(
     0.4
     """
     rollout_settings = read_section(RolloutSettings, {**settings, "seed": seed})
+    if output is not None:
+        check_output(output)
+        check_run_folder(Path(output).expanduser())
     events = event_arms(event)
     jobs = choose_episodes(tasks, episodes, rollout_settings.split, rollout_settings.env)
     if base is make_env:
