@@ -92,7 +92,7 @@ class Extension:
 
     parts: kind of `REGISTRIES` → name → module that registers it.
     commands: name → command.
-    configs: a folder of YAML files, searched after the library's.
+    configs: a folder of YAML files, searched after the library's (`config/composition.py`).
     checkpoints: name → folder.
     weight_formats: name → format that `weights` reads and writes.
     """
@@ -106,7 +106,7 @@ class Extension:
 
 @cache
 def extras() -> tuple[Extension, ...]:
-    """List the packages of `mme_vla.extras` and return their extensions."""
+    """The extensions of `mme_vla.extras`: each folder in it has `extension.py` with `EXTENSION`."""
     package = importlib.import_module("mme_vla.extras")
     names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
     modules = [importlib.import_module(f"{package.__name__}.{name}.extension") for name in names]
@@ -172,6 +172,7 @@ class Registry[T]:
     def _modules(self) -> dict[str, str]:
         """Name → module: the library's own, its extras', and those of installed packages."""
         modules = dict(self._core)
+        # All keys that mean this registry, such as `event` and `intervention` of perturbations.
         keys = {self.key, *(key for key, registry in REGISTRIES.items() if registry is self)}
         for extension in extensions():
             for key in sorted(keys):

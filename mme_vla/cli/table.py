@@ -84,7 +84,9 @@ COMMANDS = {
 
 
 def commands() -> dict[str, Command]:
-    """All commands: the core's, its extras', and those of installed packages."""
+    """All commands: the core's, its extras', and those of installed packages, in this order. The
+    first one keeps a name.
+    """
     all_commands = dict(COMMANDS)
     for extension in extensions():
         for name, command in extension.commands.items():

@@ -1,7 +1,7 @@
 """TokenDrop: the first frame whole, then the patches that changed most (paper, section 4.2)."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -59,7 +59,8 @@ class ChangeScorer(FrameScorer):
         return cells.mean(axis=(1, 3, 4), dtype=np.float32).reshape(-1)
 
 
-# Caches made before keys were derived from the code have this key.
+# The digest of `ChangeScorer` as it stands, and the key of caches from before keys had digests.
+# Another scorer has a key of its own, and its caches are built anew.
 FORMER_KEYS["5f47a9f0"] = "change{grid}x{grid}-every{stride}"
 
 
@@ -67,7 +68,11 @@ FORMER_KEYS["5f47a9f0"] = "change{grid}x{grid}-every{stride}"
 class TokenDrop(PerceptualMemory):
     """The `budget` highest-scored patches up to now, the first frame's among them, in
     time order.
+
+    Scorer: scores the patches, made from (grid, stride); a subclass may name another.
     """
+
+    Scorer: ClassVar[type[Any]] = ChangeScorer
 
     def __init__(
         self,
@@ -87,7 +92,7 @@ class TokenDrop(PerceptualMemory):
             grid: side of a frame's token grid.
             stride: frames between two scored ones.
             candidates: length of the list of best patches that is kept along an episode. With
-                `causal` it changes no choice and is checked alone.
+                `causal` it has no effect, except that it is at least the budget.
             causal: only frames up to the current one compete for that list. False lets the whole
                 episode compete, as the released offline preprocessing does; it needs a finished
                 episode.
@@ -98,14 +103,14 @@ class TokenDrop(PerceptualMemory):
             f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
             f"memory.candidates={candidates} (the patches a running list holds).",
         )
-        storage = StorageSpec(
-            grid, pooling, keep_every=stride, scorer=ChangeScorer(grid, stride).key
-        )
+        scorer = self.Scorer(grid, stride)
+        storage = StorageSpec(grid, pooling, keep_every=stride, scorer=scorer.key)
         super().__init__(d_vision, width, budget, storage, **encoder)
         self.stride, self.candidates, self.causal = stride, candidates, causal
 
-    def make_scorer(self) -> ChangeScorer:
-        return ChangeScorer(self.storage.grid, self.stride)
+    def make_scorer(self) -> FrameScorer:
+        scorer: FrameScorer = self.Scorer(self.storage.grid, self.stride)
+        return scorer
 
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None
@@ -127,6 +132,7 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
     """
     is_candidate = scores.values >= THRESHOLD
     # Sort no more patches than can stay beside the first frame's, however long the episode is.
+    # Where none can, the last line of this function leaves them all out.
     n_others = max(limit - patches, 0)
     if np.count_nonzero(is_candidate) > n_others > 0:
         values = scores.values.reshape(-1)
@@ -142,6 +148,8 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
 
 
 def most_changed(ranked: np.ndarray, step: int, budget: int) -> np.ndarray:
-    """The last `budget` of the ranked patches that lie no later than `step`, in time order."""
+    """The last `budget` of the ranked patches that lie no later than `step`, in time order; the
+    first frame's, which rank highest, are among them.
+    """
     selected = ranked[ranked[:, 0] <= step][-budget:]
     return selected[np.lexsort((selected[:, 1], selected[:, 0]))]

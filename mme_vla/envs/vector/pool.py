@@ -49,7 +49,7 @@ class Job:
 
 @dataclass
 class Reply:
-    """The result of one worker: of a reset (`reward` is None) or of a step."""
+    """The result of one worker: of a reset, which has no reward, or of a step."""
 
     worker: int
     job: Job
@@ -63,6 +63,11 @@ class Reply:
     """Why there is no result of the policy: the environment raised it, or the worker died or hung
     and was replaced.
     """
+
+    @property
+    def is_reset(self) -> bool:
+        """Whether it is the result of a reset."""
+        return self.reward is None
 
     @property
     def crashed(self) -> bool:

@@ -523,8 +523,8 @@ def make_rollout_env(
         `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test
         split.
     videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
-    run: its name, in the videos. robot,
-    max_actions: the policy's.
+    run: its name, in the videos.
+    robot, max_actions: the policy's.
     oracle: see `ChunkEnv`.
     """
     if sessions:

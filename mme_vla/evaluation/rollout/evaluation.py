@@ -503,6 +503,7 @@ class EvaluationRun:
             max_actions=settings.max_actions or info.max_actions,
             sessions=sessions,
         )
+        # It begins without jobs: `Waiting` hands them out.
         return VecEnv([], workers, make, settings.timeout_s)
 
 

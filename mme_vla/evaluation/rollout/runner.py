@@ -114,19 +114,20 @@ class Ending:
     """How an episode ended.
 
     outcome: `success`, `fail`, `timeout` or `error`.
-    error: what went wrong, where something says so.
+    reason: the error, or of another outcome why the last action was refused; None without one.
     again: whether the episode is tried once more.
     """
 
     outcome: str
-    error: str | None
+    reason: str | None
     again: bool
 
 
 class Rollout:
     """Runs episodes and records each when it ends.
 
-    A subclass may override three methods: `on_reply`, `choose` and `on_end`.
+    A subclass may override `on_reply`, `choose` and `on_end`. The last one writes the record: call
+    `super().on_end` to keep it.
     """
 
     def __init__(
@@ -240,7 +241,7 @@ class Rollout:
         if reply.done:
             self._take_last(running, reply)
             return
-        if reply.reward is None:
+        if reply.is_reset:
             self._stillborn = 0
             if self._restarts(running, reply):
                 return
@@ -410,7 +411,7 @@ class Rollout:
             outcome=ending.outcome,
             steps=running.steps,
             seconds=running.seconds,
-            error=ending.error if failed else None,
+            error=ending.reason if failed else None,
             env=self.settings.env,
             goal=running.episode.goal,
             chunks=running.chunks,
@@ -418,7 +419,7 @@ class Rollout:
             actions_sha256=running.actions_sha256,
             suite=source.suite_of(job.task),
             groups=source.groups_of(job.task) or None,
-            refused=None if failed else ending.error,
+            refused=None if failed else ending.reason,
             video=running.report.video,
             process=running.process,
             events=tuple(running.events.log),

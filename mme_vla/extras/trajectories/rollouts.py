@@ -304,7 +304,7 @@ class _Collector(Rollout):
         report = Report() if reply.error else reply.info
         self._oracle[running] = report.oracle
         decisions = self._decisions[running]
-        if reply.reward is None or not decisions:
+        if reply.is_reset or not decisions:
             return
         last = decisions[-1]
         last.reward += float(reply.reward)
@@ -404,7 +404,7 @@ class _Collector(Rollout):
             torch.stack(log_probs) if log_probs else None,
             torch.stack(paths) if paths else None,
             oracle,
-            ending.error if ending.outcome == "error" else None,
+            ending.reason if ending.outcome == "error" else None,
         )
 
     @property
