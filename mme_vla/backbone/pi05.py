@@ -156,9 +156,9 @@ class Pi05Backbone(
             x = nn.functional.silu(float32_linear(layer, x))
         return x
 
-    def read_velocity(self, hidden: Tensor) -> Tensor:
-        """The network's output [b, h, a] in float32, of `flow` a velocity, of `clean_flow` a chunk.
-        The last h tokens of [b, n, d] are the actions.
+    def project_actions(self, hidden: Tensor) -> Tensor:
+        """The network's output [b, h, a] in float32, which its head reads. The last h tokens of [b,
+        n, d] are the actions.
         """
         return self._float32_linear(self.action_out, hidden[:, -self.horizon :])
 
@@ -174,11 +174,11 @@ class Pi05Backbone(
         return self.head.loss(self.predictor(batch, injection), batch.actions, noise)
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
-        return partial(self.velocity, injection)
+        return partial(self.predict, injection)
 
-    def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
-        """The network's output (`read_velocity`) [b, h, a] at noisy chunks x_t [b, h, a] and times
-        [b], in one joint pass.
+    def predict(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
+        """The network's output [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint
+        pass.
         """
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
         layout = self.transformer.layout(blocks, injection.visibility)
@@ -186,7 +186,7 @@ class Pi05Backbone(
         if injection.condition is not None:
             condition = injection.condition(condition)
         hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
-        return self.read_velocity(hidden)
+        return self.project_actions(hidden)
 
     # Sampling
 
@@ -232,13 +232,13 @@ class Pi05Backbone(
             ]
             conditions = self.transformer.conditioning(torch.cat(condition))
 
-        def output(x_t: Tensor, index: int) -> Tensor:
+        def predict(x_t: Tensor, index: int) -> Tensor:
             blocks = [*injection.beside, self.action_block(x_t)]
             condition = conditions.at(index, rows)
             hidden, _ = self.transformer(blocks, layout, condition, injection.hook, prefix)
-            return self.read_velocity(hidden)
+            return self.project_actions(hidden)
 
-        velocity = self.head.velocity(output, times, noise)
+        velocity = self.head.velocity(predict, times, noise)
         if batch.overlap is not None:
             from mme_vla.speed.rtc import rtc_guidance
 

@@ -265,11 +265,12 @@ class MMEPolicy(NetworkPolicy):
         loss = self.model.loss(batch, values, memory, augmentation, metrics)
         return loss, metrics
 
-    def velocity(
+    def predict(
         self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None
     ) -> Tensor:
-        """The network's output [b, h, a] of a flow backbone, of `flow` a velocity, at noisy chunks
-        x_t [b, h, a] and times [b], in one pass.
+        """The network's output [b, h, a] of a backbone with a flow head, at noisy chunks x_t [b, h,
+        a] and times [b], in one pass. The head `flow` reads it as a velocity, `clean_flow` as a
+        chunk.
         """
         assert isinstance(self.backbone, HasFlowHead)
         if memory is None:

@@ -73,14 +73,14 @@ def test_missing_noise_is_sampled(policy: MMEPolicy) -> None:
 def test_a_chunk_takes_six_calls_in_four_files(
     policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read_velocity: Callable[..., Any] = policy.backbone.read_velocity
+    project_actions: Callable[..., Any] = policy.backbone.project_actions
     stacks: list[traceback.StackSummary] = []
 
     def watched(hidden: torch.Tensor) -> torch.Tensor:
         stacks.append(traceback.extract_stack())
-        return read_velocity(hidden)
+        return project_actions(hidden)
 
-    monkeypatch.setattr(policy.backbone, "read_velocity", watched)
+    monkeypatch.setattr(policy.backbone, "project_actions", watched)
     episode = policy.start_episode("press the button")
     frames = moving_frames(1)
     episode.observe({"front": frames, "wrist": frames}, np.zeros((1, 8), np.float32))
@@ -94,7 +94,7 @@ def test_a_chunk_takes_six_calls_in_four_files(
         "sample_actions",
         "sample",  # of the model
         "sample",  # of the backbone, which has the Euler steps
-        "output",
+        "predict",
     ]
     assert len({frame.filename for frame in calls}) == 4
 
