@@ -35,7 +35,7 @@ from mme_vla.backbone.layers import Block, autocast
 from mme_vla.errors import UserError, check_known
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise, to_unit_range
+from mme_vla.types import Batch, MemoryTokens, Noise, to_unit_range
 
 
 def unit_images(images: Tensor, augmentation: Tensor | None = None) -> Tensor:
@@ -176,21 +176,21 @@ class MMEModel(nn.Module):
 
     # The steps, in order
 
-    def conditioned_history(self, batch: Batch) -> HistoryTokens | None:
-        """The batch's selection as the backbone reads it with the prompt."""
-        if self.memory is None or batch.history is None:
-            return None
-        condition = partial(
+    def prompt_condition(self, batch: Batch) -> Callable[[Tensor], Tensor]:
+        """What makes stored tokens [b, n, d_vision] those that the backbone reads with the batch's
+        prompts. A selection goes through it in `memory_tokens`, and an episode's tokens as they are
+        gathered (`PromptConditionedHistory`).
+        """
+        return partial(
             self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask
         )
-        return self.memory.condition_on_prompt(batch.history, condition)
 
     def memory_tokens(self, batch: Batch) -> MemoryTokens | None:
         """Memory tokens of the batch's selection, or None without memory."""
+        if self.memory is None or batch.history is None:
+            return None
         with self.autocast():
-            history = self.conditioned_history(batch)
-            if self.memory is None or history is None:
-                return None
+            history = self.memory.condition_on_prompt(batch.history, self.prompt_condition(batch))
             return self.memory(history)
 
     def prepare_images(self, batch: Batch, augmentation: Tensor | None = None) -> Batch:

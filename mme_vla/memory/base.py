@@ -146,8 +146,8 @@ class MemoryModule(nn.Module):
     def condition_on_prompt(
         self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
-        """A selection as the backbone reads it with a prompt: `condition` [b, n, d_vision] of its
-        vision tokens.
+        """A selection as the backbone reads it with a prompt: its vision tokens [b, n, d_vision]
+        through `condition` (`MMEModel.prompt_condition`).
         """
         if self.uses_proprio:  # its features are states and actions
             return history

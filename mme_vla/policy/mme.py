@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -443,7 +442,7 @@ class MMEPolicy(NetworkPolicy):
         with self.autocast():
             histories = []
             for i, episode in enumerate(episodes):
-                condition = partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i])
+                condition = self.model.prompt_condition(batch.rows(slice(i, i + 1)))
                 history = PromptConditionedHistory(episode.required_history(), condition)
                 episode.read = history
                 histories.append(history)
@@ -461,10 +460,6 @@ class MMEPolicy(NetworkPolicy):
         if self.memory is None:
             return np.zeros(0, np.int64)
         return self.memory.frames_read(steps, exec_start)
-
-    def _condition_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
-        """Stored tokens [n, d_vision] of one episode, read with its prompt [l]."""
-        return self.backbone.condition_on_prompt(tokens[None], prompt[None], prompt_mask[None])[0]
 
     @property
     def memory_tower(self) -> MemoryTower:
