@@ -64,7 +64,9 @@ class MMEPolicy(NetworkPolicy):
     """One composition of backbone, memory and integration, as a policy. No method depends on the
     variant.
 
-    model: the network. Its modules `backbone`, `memory` and `integration` are the policy's own too.
+    model: the network. Policy and model share the modules `backbone`, `memory` and `integration`:
+        names of weights have no prefix, and a part that is replaced in one is replaced in both.
+        `compute_dtype`, `loss_weights` and the mode of training are the model's.
     """
 
     model: MMEModel
@@ -95,9 +97,9 @@ class MMEPolicy(NetworkPolicy):
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32:
                 `ieee` or `tf32`.
         """
+        # The model is no submodule: the policy shares its table of modules, see above. It comes
+        # before `super().__init__`, which sets `compute_dtype`.
         model = MMEModel(backbone, memory, integration, transform_images=self.transform_images)
-        # Before `super().__init__`, whose `compute_dtype` the model keeps; `nn.Module` refuses to
-        # register a module that early.
         object.__setattr__(self, "model", model)
         super().__init__(
             processor,
@@ -106,8 +108,6 @@ class MMEPolicy(NetworkPolicy):
             history_dtype=history_dtype,
             augment=augment,
         )
-        # The model's modules are the policy's, so that the names of weights have no prefix and a
-        # part that is replaced in one is replaced in both.
         self._modules = model._modules
         self.horizon = backbone.horizon
         self.action_dim = backbone.action_dim
@@ -251,17 +251,19 @@ class MMEPolicy(NetworkPolicy):
                 "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
                 " None)."
             )
+        # The random numbers of the loss and of the augmentation: as given, the others sampled.
         count, generator = len(batch.actions), torch.default_generator
-        values = named_noise(noise, time=time)
+        draws = named_noise(noise, time=time)
         is_complete = isinstance(noise, Mapping) or (noise is not None and time is not None)
-        if not values or not is_complete:
-            values = self.training_noise(count, generator) | values
-        if "changes" not in values:
-            values = self.augmentation_params(count, generator) | values
-        values = map_noise(values, lambda value: value.to(self.device))
-        augmentation = values.pop("changes", None)
+        if not draws or not is_complete:
+            draws = self.training_noise(count, generator) | draws
+        if "changes" not in draws:
+            draws = self.augmentation_params(count, generator) | draws
+        draws = map_noise(draws, lambda value: value.to(self.device))
+        augmentation = draws.pop("changes", None)
+
         metrics: dict[str, Tensor] = {}
-        loss = self.model.loss(batch, values, memory, augmentation, metrics)
+        loss = self.model.loss(batch, draws, memory, augmentation, metrics)
         return loss, metrics
 
     def predict(
