@@ -144,24 +144,6 @@ class Pi05Backbone(
             Block("prompt", words, batch.prompt_mask, "vlm"),
         ]
 
-    def action_block(self, x_t: Tensor) -> Block:
-        """The noisy chunk [b, h, a] as the block of the action expert."""
-        mask = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
-        return Block("action", self._float32_linear(self.action_in, x_t), mask, "action")
-
-    def time_condition(self, time: Tensor) -> Tensor:
-        """Condition [b, d_action] of the adaptive norms for flow times [b], in float32."""
-        x = time_embedding(time, self.config.action.width)
-        for layer in (self.time_in, self.time_out):
-            x = nn.functional.silu(float32_linear(layer, x))
-        return x
-
-    def project_actions(self, hidden: Tensor) -> Tensor:
-        """The network's output [b, h, a] in float32, which its head reads. The last h tokens of [b,
-        n, d] are the actions.
-        """
-        return self._float32_linear(self.action_out, hidden[:, -self.horizon :])
-
     # Training
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
@@ -187,6 +169,24 @@ class Pi05Backbone(
             condition = injection.condition(condition)
         hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.project_actions(hidden)
+
+    def action_block(self, x_t: Tensor) -> Block:
+        """The noisy chunk [b, h, a] as the block of the action expert."""
+        mask = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
+        return Block("action", self._float32_linear(self.action_in, x_t), mask, "action")
+
+    def time_condition(self, time: Tensor) -> Tensor:
+        """Condition [b, d_action] of the adaptive norms for flow times [b], in float32."""
+        x = time_embedding(time, self.config.action.width)
+        for layer in (self.time_in, self.time_out):
+            x = nn.functional.silu(float32_linear(layer, x))
+        return x
+
+    def project_actions(self, hidden: Tensor) -> Tensor:
+        """The network's output [b, h, a] in float32, which its head reads. The last h tokens of [b,
+        n, d] are the actions.
+        """
+        return self._float32_linear(self.action_out, hidden[:, -self.horizon :])
 
     # Sampling
 
