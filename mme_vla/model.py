@@ -8,11 +8,20 @@ Data flows down once. The backbone does not call the integration, and neither kn
 made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are in other
 packages.
 
-    backbone/   base.py (interface) · layers.py (visibility, attention, norms) · gemma.py (joint
-                experts, KV cache) · siglip.py · flow.py · pi05.py
-    memory/     base.py (interface, encoder) · history.py (stored tokens of an episode) ·
-                framesamp.py · …
-    integration/ base.py (interface) · context.py (context, expert) · modulator.py
+From image to loss in the order of the calls, with FrameSamp and Modulator:
+
+    MMEModel.loss              here: images, memory tokens, injection, loss
+    PerceptualMemory.forward   memory/base.py: a token of each stored feature and its position
+    Pi05Backbone.embed         backbone/pi05.py: blocks of images (siglip.py) and prompt
+    Integration.inject         integration/base.py: what memory adds to the blocks
+    Modulator.hook             integration/modulator.py: keys and values of memory, once a layer
+    FlowHead.loss              backbone/flow.py: noisy actions, and the error of the prediction
+    Pi05Backbone.predict       backbone/pi05.py: one pass over images, prompt and noisy actions
+    JointTransformer.layout    backbone/gemma.py: who attends to whom, and positions (layers.py)
+    JointTransformer.forward   backbone/gemma.py: layer after layer
+    JointBlock.forward         backbone/gemma.py: experts project, attend as one, and finish
+    ModulatorLayer.forward     integration/modulator.py: the hook, before the MLP
+    masked_mean                here: the mean over steps and samples
 
 A memory works in two steps. `MemoryModule.gather_selection` chooses stored tokens, in a dataset or
 in an episode, and makes `Batch.history`. `MemoryModule.forward`, called here, encodes them. The

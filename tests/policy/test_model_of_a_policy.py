@@ -3,9 +3,12 @@ sampled chunk.
 """
 
 import copy
+import re
+import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -14,7 +17,7 @@ import torch
 
 from mme_vla import MMEPolicy, UserError
 from mme_vla.memory.base import stack_history
-from mme_vla.model import unit_images
+from mme_vla.model import MMEModel, unit_images
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 
 
@@ -97,6 +100,27 @@ def test_a_chunk_takes_six_calls_in_four_files(
         "predict",
     ]
     assert len({frame.filename for frame in calls}) == 4
+
+
+def test_the_model_lists_the_calls_of_a_loss_in_their_order() -> None:
+    policy = small_policy("framesamp_modul")
+    batch = random_batch(policy, valid=64)
+    noise = policy.training_noise(2, torch.Generator().manual_seed(0))
+    called: dict[str, None] = {}
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            called.setdefault(frame.f_code.co_qualname)
+
+    sys.setprofile(note)
+    try:
+        policy.model.loss(batch, noise)
+    finally:
+        sys.setprofile(None)
+    page = sys.modules[MMEModel.__module__].__doc__ or ""
+    listed = re.findall(r"^    ([\w.]+) +(?:here|\w+/\w+\.py): ", page, re.MULTILINE)
+    assert len(listed) == 12
+    assert listed == [name for name in called if name in listed]
 
 
 def test_a_model_without_a_transform_refuses_augmentation() -> None:
