@@ -292,17 +292,6 @@ class JointBlock(nn.Module):
         return updated, (k, v)
 
 
-@dataclass
-class KVCache:
-    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens
-    are valid.
-    """
-
-    layers: Sequence[KeyValue | StaticKV]
-    spans: list[Span]
-    mask: Tensor  # [b, past] bool
-
-
 class Layout(NamedTuple):
     """What attention needs to know of a pass beside its tokens; the same for every Euler step of a
     chunk.
@@ -314,6 +303,17 @@ class Layout(NamedTuple):
     rope: Rotation
     mask_layout: MaskLayout
     dtype: torch.dtype  # of the tokens in all layers
+
+
+@dataclass
+class KVCache:
+    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens
+    are valid.
+    """
+
+    layers: Sequence[KeyValue | StaticKV]
+    spans: list[Span]
+    mask: Tensor  # [b, past] bool
 
 
 @dataclass
@@ -362,41 +362,9 @@ class JointTransformer(nn.Module):
         width = experts[action_expert].width
         self.final_norm = AdaRMSNorm(width, width)
 
-    def conditioning(self, condition: Tensor) -> Conditioning:
-        """Compute every layer's modulation for conditions [m, c] at once: the weights are read
-        once, not m times.
-        """
-        *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
-        pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
-        return Conditioning([LayerModulation(*pair) for pair in pairs], final)
-
-    def modulating(self) -> list[AdaRMSNorm]:
-        """The norms that a condition modulates: two of every layer, and the final one."""
-        norms = []
-        for block in self.layers:
-            expert: Any = block.experts[self.action_expert]  # type: ignore[index]
-            norms += [expert.attention_norm, expert.mlp_norm]
-        return [*norms, self.final_norm]
-
     @property
     def _compiled(self) -> bool:
         return self.layers[0]._compiled_call_impl is not None
-
-    def cache_space(self, blocks: Sequence[Block], following: int) -> KVCache:
-        """An empty cache with space for a pass over `blocks`, and behind them for every one of many
-        passes of `following` tokens.
-
-        The space behind them is for one pass at a time: no such pass can be kept (`forward`), and
-        each overwrites the last.
-        """
-        tokens = sum(len(block) for block in blocks) + following
-        first = blocks[0].tokens
-        size = (len(first), tokens, self.kv_heads, self.head_dim)
-        layers = []
-        for _ in self.layers:
-            keys = first.new_empty(size, dtype=compute_dtype(first))
-            layers.append(StaticKV(keys, torch.empty_like(keys), 0))
-        return KVCache(layers, [], blocks[0].mask[:, :0])
 
     def layout(
         self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None
@@ -483,6 +451,40 @@ class JointTransformer(nn.Module):
         if segment.expert == self.action_expert and condition is not None:
             gate = condition.final.gate  # of any value; this one is no other input of the layer
         return segment._replace(update=torch.zeros_like(segment.tokens), gate=gate)
+
+    # Sampling
+
+    def cache_space(self, blocks: Sequence[Block], following: int) -> KVCache:
+        """An empty cache with space for a pass over `blocks`, and behind them for every one of many
+        passes of `following` tokens.
+
+        The space behind them is for one pass at a time: no such pass can be kept (`forward`), and
+        each overwrites the last.
+        """
+        tokens = sum(len(block) for block in blocks) + following
+        first = blocks[0].tokens
+        size = (len(first), tokens, self.kv_heads, self.head_dim)
+        layers = []
+        for _ in self.layers:
+            keys = first.new_empty(size, dtype=compute_dtype(first))
+            layers.append(StaticKV(keys, torch.empty_like(keys), 0))
+        return KVCache(layers, [], blocks[0].mask[:, :0])
+
+    def conditioning(self, condition: Tensor) -> Conditioning:
+        """Compute every layer's modulation for conditions [m, c] at once: the weights are read
+        once, not m times.
+        """
+        *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
+        pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
+        return Conditioning([LayerModulation(*pair) for pair in pairs], final)
+
+    def modulating(self) -> list[AdaRMSNorm]:
+        """The norms that a condition modulates: two of every layer, and the final one."""
+        norms = []
+        for block in self.layers:
+            expert: Any = block.experts[self.action_expert]  # type: ignore[index]
+            norms += [expert.attention_norm, expert.mlp_norm]
+        return [*norms, self.final_norm]
 
 
 def read_out(norm: AdaRMSNorm, segment: Segment, condition: Tensor | Modulation) -> Tensor:
