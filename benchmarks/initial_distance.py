@@ -25,9 +25,9 @@ def distance(name: str, **overrides: object) -> float:
         batch = random_batch(baseline, seed=seed)
         noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(seed))
         time = torch.full((len(noise),), 0.5)
-        before = baseline.velocity(batch, noise, time)
+        before = baseline.predict(batch, noise, time)
         batch.history = random_history(remembering, len(noise), remembering.memory.budget, seed)
-        after = remembering.velocity(batch, noise, time)
+        after = remembering.predict(batch, noise, time)
         distances.append(float((after - before).norm() / before.norm()))
     return sum(distances) / len(distances)
 

@@ -8,11 +8,20 @@ Data flows down once. The backbone does not call the integration, and neither kn
 made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are in other
 packages.
 
-    backbone/   base.py (interface) · layers.py (visibility, attention, norms) · gemma.py (joint
-                experts, KV cache) · siglip.py · flow.py · pi05.py
-    memory/     base.py (interface, encoder) · history.py (stored tokens of an episode) ·
-                framesamp.py · …
-    integration/ base.py (interface) · context.py (context, expert) · modulator.py
+From image to loss in the order of the calls, with FrameSamp and Modulator:
+
+    MMEModel.loss              here: images, memory tokens, injection, loss
+    PerceptualMemory.forward   memory/base.py: a token of each stored feature and its position
+    Pi05Backbone.embed         backbone/pi05.py: blocks of images (siglip.py) and prompt
+    Integration.inject         integration/base.py: what memory adds to the blocks
+    Modulator.hook             integration/modulator.py: keys and values of memory, once a layer
+    FlowHead.loss              backbone/flow.py: noisy actions, and the error of the prediction
+    Pi05Backbone.predict       backbone/pi05.py: one pass over images, prompt and noisy actions
+    JointTransformer.layout    backbone/gemma.py: who attends to whom, and positions (layers.py)
+    JointTransformer.forward   backbone/gemma.py: layer after layer
+    JointBlock.forward         backbone/gemma.py: experts project, attend as one, and finish
+    ModulatorLayer.forward     integration/modulator.py: the hook, before the MLP
+    masked_mean                here: the mean over steps and samples
 
 A memory works in two steps. `MemoryModule.gather_selection` chooses stored tokens, in a dataset or
 in an episode, and makes `Batch.history`. `MemoryModule.forward`, called here, encodes them. The
@@ -35,7 +44,7 @@ from mme_vla.backbone.layers import Block, autocast
 from mme_vla.errors import UserError, check_known
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise, to_unit_range
+from mme_vla.types import Batch, MemoryTokens, Noise, to_unit_range
 
 
 def unit_images(images: Tensor, augmentation: Tensor | None = None) -> Tensor:
@@ -89,6 +98,53 @@ class MMEModel(nn.Module):
         self.compute_dtype = compute_dtype
         self.transform_images = transform_images
 
+    # The steps, in order
+
+    def prepare_images(self, batch: Batch, augmentation: Tensor | None = None) -> Batch:
+        """The batch with its views, past ones included, in [−1, 1] float32. Past views change as
+        the current ones do.
+
+        Args:
+            batch: images uint8.
+            augmentation: random numbers [b, …] of the image augmentation.
+        """
+        images = self.transform_images(batch.images, augmentation)
+        past = batch.past
+        if past is None:
+            return replace(batch, images=images)
+        if augmentation is not None:
+            augmentation = augmentation.repeat_interleave(past.images.shape[1], 0)
+        frames = self.transform_images(past.images.flatten(0, 1), augmentation)
+        past = replace(past, images=frames.unflatten(0, past.images.shape[:2]))
+        return replace(batch, images=images, past=past)
+
+    def prompt_condition(self, batch: Batch) -> Callable[[Tensor], Tensor]:
+        """What makes stored tokens [b, n, d_vision] those that the backbone reads with the batch's
+        prompts. A selection goes through it in `memory_tokens`, and an episode's tokens as they are
+        gathered (`PromptConditionedHistory`).
+        """
+        return partial(
+            self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask
+        )
+
+    def memory_tokens(self, batch: Batch) -> MemoryTokens | None:
+        """Memory tokens of the batch's selection, or None without memory."""
+        if self.memory is None or batch.history is None:
+            return None
+        with self.autocast():
+            history = self.memory.condition_on_prompt(batch.history, self.prompt_condition(batch))
+            return self.memory(history)
+
+    def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
+        """The observation's blocks with memory added. The batch's images are prepared."""
+        injection = self.integration.inject(self.backbone.embed(batch), memory)
+        if "positions" not in self.backbone.supports:
+            for block in injection.blocks:
+                check_uncounted(block, self.backbone)
+        return injection
+
+    # Loss and samples
+
     def loss(
         self,
         batch: Batch,
@@ -113,16 +169,28 @@ class MMEModel(nn.Module):
             memory = self.memory_tokens(batch)
         with self.autocast():
             rows = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
-        losses = {"action": masked_mean(rows, batch.action_mask, batch.weight)}
+        action = masked_mean(rows, batch.action_mask, batch.weight)
+
+        auxiliary: dict[str, Tensor] = {}
         if memory is not None and self.training:
             for name, values in memory.losses.items():
                 check_auxiliary(name, values, len(batch.prompt))
-                losses[name] = weighted_mean(values.float(), batch.weight)
-        total = self._total(losses)
+                auxiliary[name] = weighted_mean(values.float(), batch.weight)
+        if self.training:
+            for name in self.loss_weights:
+                check_known("auxiliary loss in train.losses:", name, list(auxiliary))
+
+        total = action
+        for name, value in auxiliary.items():
+            weight = self.loss_weights.get(name, 1.0)
+            if weight:  # 0 leaves one out
+                total = total + weight * value
+
         if metrics is not None:
             metrics["loss"] = total.detach()
-            if len(losses) > 1:
-                metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
+            if auxiliary:
+                for name, value in {"action": action, **auxiliary}.items():
+                    metrics[f"losses/{name}"] = value.detach()
             if memory is not None:
                 metrics |= memory.logged()
         return total
@@ -138,19 +206,6 @@ class MMEModel(nn.Module):
         is called.
         """
         return self.loss(batch, noise, memory, augmentation)
-
-    def _total(self, losses: Mapping[str, Tensor]) -> Tensor:
-        """`action`, and the others times their weights. Weight 0 leaves one out."""
-        total = losses["action"]
-        for name, value in losses.items():
-            weight = self.loss_weights.get(name, 1.0)
-            if name != "action" and weight:
-                total = total + weight * value
-        if self.training:
-            auxiliary = [name for name in losses if name != "action"]
-            for name in self.loss_weights:
-                check_known("auxiliary loss in train.losses:", name, auxiliary)
-        return total
 
     @torch.no_grad()
     def sample(
@@ -173,51 +228,6 @@ class MMEModel(nn.Module):
         batch = self.prepare_images(batch)
         with self.autocast():
             return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
-
-    # The steps, in order
-
-    def conditioned_history(self, batch: Batch) -> HistoryTokens | None:
-        """The batch's selection as the backbone reads it with the prompt."""
-        if self.memory is None or batch.history is None:
-            return None
-        condition = partial(
-            self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask
-        )
-        return self.memory.condition_on_prompt(batch.history, condition)
-
-    def memory_tokens(self, batch: Batch) -> MemoryTokens | None:
-        """Memory tokens of the batch's selection, or None without memory."""
-        with self.autocast():
-            history = self.conditioned_history(batch)
-            if self.memory is None or history is None:
-                return None
-            return self.memory(history)
-
-    def prepare_images(self, batch: Batch, augmentation: Tensor | None = None) -> Batch:
-        """The batch with its views, past ones included, in [−1, 1] float32. Past views change as
-        the current ones do.
-
-        Args:
-            batch: images uint8.
-            augmentation: random numbers [b, …] of the image augmentation.
-        """
-        images = self.transform_images(batch.images, augmentation)
-        past = batch.past
-        if past is None:
-            return replace(batch, images=images)
-        if augmentation is not None:
-            augmentation = augmentation.repeat_interleave(past.images.shape[1], 0)
-        frames = self.transform_images(past.images.flatten(0, 1), augmentation)
-        past = replace(past, images=frames.unflatten(0, past.images.shape[:2]))
-        return replace(batch, images=images, past=past)
-
-    def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
-        """The observation's blocks with memory added. The batch's images are prepared."""
-        injection = self.integration.inject(self.backbone.embed(batch), memory)
-        if "positions" not in self.backbone.supports:
-            for block in injection.blocks:
-                check_uncounted(block, self.backbone)
-        return injection
 
     # Noise, device, precision
 

@@ -66,9 +66,8 @@ class LayerModulation(NamedTuple):
 class Segment(NamedTuple):
     """Neighbouring blocks of one expert, run as one matrix.
 
-    update, gate: of the sublayer before, where the sum is left to the layer that reads it: it is
-        then one kernel with that layer's norm. Such a layer leaves its own last sum to the next
-        one.
+    tokens: [b, n, d].
+    update, gate: of the sublayer before, still to be added to the tokens; None where they are.
     """
 
     expert: str
@@ -77,7 +76,7 @@ class Segment(NamedTuple):
     gate: Tensor | None = None
 
     def summed(self) -> Tensor:
-        """The tokens with the update [b, n, d]."""
+        """The tokens, with the update added [b, n, d]."""
         if self.update is None:
             return self.tokens
         return _residual(self.tokens, self.update, self.gate)
@@ -186,17 +185,12 @@ class Querying(NamedTuple):
     rows: its place in the sequence.
     x: its tokens [b, n, d].
     gate: of the attention's output.
-    condition: of the MLP's norm.
-    hook: changes what the MLP reads.
     """
 
-    segment: Segment
-    layer: ExpertLayer
+    expert: str
     rows: slice
     x: Tensor
     gate: Tensor | None
-    condition: Tensor | Modulation | None
-    hook: Callable[[Tensor], Tensor] | None
 
 
 class JointBlock(nn.Module):
@@ -246,31 +240,32 @@ class JointBlock(nn.Module):
             The updated segments (of those that have queries), and this pass's keys (rotated) and
             values.
         """
-        of_attention: Tensor | Modulation | None
-        of_mlp: Tensor | Modulation | None
+        # While compiled layers sample, the sum that ends a layer is deferred: the next one adds it
+        # in one kernel with its first norm. All segments of the pass then come with an update.
+        defers_sum = segments[0].update is not None
+        attention_condition: Tensor | Modulation | None
+        mlp_condition: Tensor | Modulation | None
         if isinstance(condition, LayerModulation):
-            of_attention, of_mlp = condition.attention, condition.mlp
+            attention_condition, mlp_condition = condition.attention, condition.mlp
         else:
-            of_attention = of_mlp = condition
+            attention_condition = mlp_condition = condition
 
-        # Every expert projects its own tokens.
+        # Every expert projects its own tokens. Only the action expert's norms have a condition.
         querying: list[Querying] = []
         queries, keys, values = [], [], []
         row = 0
         for segment in segments:
             layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
-            adaptive = segment.expert == self.action_expert
             rows = slice(row, row + segment.tokens.shape[1])
-            of_norm = of_attention if adaptive else None
+            row = rows.stop
             x = segment.summed()
+            of_norm = attention_condition if segment.expert == self.action_expert else None
             q, k, v, gate = layer.project(x, rope.rows(rows), of_norm)
             keys.append(k)
             values.append(v)
             if q is not None:
-                mlp_condition, mlp_hook = (of_mlp, hook) if adaptive else (None, None)
-                querying.append(Querying(segment, layer, rows, x, gate, mlp_condition, mlp_hook))
                 queries.append(q)
-            row = rows.stop
+                querying.append(Querying(segment.expert, rows, x, gate))
 
         # All queries read all keys, those of earlier passes first.
         k, v = _join(keys), _join(values)
@@ -281,28 +276,20 @@ class JointBlock(nn.Module):
             mask = select_rows(mask, [each.rows for each in querying], k.dtype)
         attended = attend(_join(queries), all_k, all_v, mask)
 
-        # Every expert finishes its own.
-        lengths = [each.rows.stop - each.rows.start for each in querying]
-        pieces = attended.split(lengths, dim=1)
+        # Every expert finishes its own. Only the action expert has a hook.
+        lengths = [each.x.shape[1] for each in querying]
         updated = []
-        for each, piece in zip(querying, pieces, strict=True):
-            finished = each.layer.finish(each.x, piece, each.gate, each.condition, each.hook)
-            following = Segment(each.segment.expert, *finished)
-            if each.segment.update is None:
-                following = Segment(following.expert, following.summed())
+        for each, piece in zip(querying, attended.split(lengths, dim=1), strict=True):
+            layer = self.experts[each.expert]  # type: ignore[assignment]
+            if each.expert == self.action_expert:
+                finished = layer.finish(each.x, piece, each.gate, mlp_condition, hook)
+            else:
+                finished = layer.finish(each.x, piece, each.gate, None, None)
+            following = Segment(each.expert, *finished)
+            if not defers_sum:
+                following = Segment(each.expert, following.summed())
             updated.append(following)
         return updated, (k, v)
-
-
-@dataclass
-class KVCache:
-    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens
-    are valid.
-    """
-
-    layers: Sequence[KeyValue | StaticKV]
-    spans: list[Span]
-    mask: Tensor  # [b, past] bool
 
 
 class Layout(NamedTuple):
@@ -316,6 +303,17 @@ class Layout(NamedTuple):
     rope: Rotation
     mask_layout: MaskLayout
     dtype: torch.dtype  # of the tokens in all layers
+
+
+@dataclass
+class KVCache:
+    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens
+    are valid.
+    """
+
+    layers: Sequence[KeyValue | StaticKV]
+    spans: list[Span]
+    mask: Tensor  # [b, past] bool
 
 
 @dataclass
@@ -364,41 +362,9 @@ class JointTransformer(nn.Module):
         width = experts[action_expert].width
         self.final_norm = AdaRMSNorm(width, width)
 
-    def conditioning(self, condition: Tensor) -> Conditioning:
-        """Compute every layer's modulation for conditions [m, c] at once: the weights are read
-        once, not m times.
-        """
-        *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
-        pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
-        return Conditioning([LayerModulation(*pair) for pair in pairs], final)
-
-    def modulating(self) -> list[AdaRMSNorm]:
-        """The norms that a condition modulates: two of every layer, and the final one."""
-        norms = []
-        for block in self.layers:
-            expert: Any = block.experts[self.action_expert]  # type: ignore[index]
-            norms += [expert.attention_norm, expert.mlp_norm]
-        return [*norms, self.final_norm]
-
     @property
     def _compiled(self) -> bool:
         return self.layers[0]._compiled_call_impl is not None
-
-    def cache_space(self, blocks: Sequence[Block], following: int) -> KVCache:
-        """An empty cache with space for a pass over `blocks`, and behind them for every one of many
-        passes of `following` tokens.
-
-        The space behind them is for one pass at a time: no such pass can be kept (`forward`), and
-        each overwrites the last.
-        """
-        tokens = sum(len(block) for block in blocks) + following
-        first = blocks[0].tokens
-        size = (len(first), tokens, self.kv_heads, self.head_dim)
-        layers = []
-        for _ in self.layers:
-            keys = first.new_empty(size, dtype=compute_dtype(first))
-            layers.append(StaticKV(keys, torch.empty_like(keys), 0))
-        return KVCache(layers, [], blocks[0].mask[:, :0])
 
     def layout(
         self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None
@@ -447,7 +413,7 @@ class JointTransformer(nn.Module):
         """
         segments = _segments(blocks, layout.dtype, self._compiled)
         is_compiled = self._compiled and not torch.is_grad_enabled()
-        if is_compiled and not isinstance(condition, Tensor):  # while sampling
+        if is_compiled and not isinstance(condition, Tensor):  # while sampling: sums are deferred
             segments = [self._with_update(segment, condition) for segment in segments]
         cached: list[KeyValue | StaticKV] = []
         for i, block in enumerate(self.layers):
@@ -485,6 +451,40 @@ class JointTransformer(nn.Module):
         if segment.expert == self.action_expert and condition is not None:
             gate = condition.final.gate  # of any value; this one is no other input of the layer
         return segment._replace(update=torch.zeros_like(segment.tokens), gate=gate)
+
+    # Sampling
+
+    def cache_space(self, blocks: Sequence[Block], following: int) -> KVCache:
+        """An empty cache with space for a pass over `blocks`, and behind them for every one of many
+        passes of `following` tokens.
+
+        The space behind them is for one pass at a time: no such pass can be kept (`forward`), and
+        each overwrites the last.
+        """
+        tokens = sum(len(block) for block in blocks) + following
+        first = blocks[0].tokens
+        size = (len(first), tokens, self.kv_heads, self.head_dim)
+        layers = []
+        for _ in self.layers:
+            keys = first.new_empty(size, dtype=compute_dtype(first))
+            layers.append(StaticKV(keys, torch.empty_like(keys), 0))
+        return KVCache(layers, [], blocks[0].mask[:, :0])
+
+    def conditioning(self, condition: Tensor) -> Conditioning:
+        """Compute every layer's modulation for conditions [m, c] at once: the weights are read
+        once, not m times.
+        """
+        *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
+        pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
+        return Conditioning([LayerModulation(*pair) for pair in pairs], final)
+
+    def modulating(self) -> list[AdaRMSNorm]:
+        """The norms that a condition modulates: two of every layer, and the final one."""
+        norms = []
+        for block in self.layers:
+            expert: Any = block.experts[self.action_expert]  # type: ignore[index]
+            norms += [expert.attention_norm, expert.mlp_norm]
+        return [*norms, self.final_norm]
 
 
 def read_out(norm: AdaRMSNorm, segment: Segment, condition: Tensor | Modulation) -> Tensor:

@@ -182,33 +182,6 @@ def visible_blocks(name: str, table: Visibility) -> frozenset[str] | set[str]:
     return table[name]
 
 
-def attention_mask(
-    queries: Sequence[Span],
-    keys: Sequence[Span],
-    query_mask: Tensor,
-    key_mask: Tensor,
-    table: Visibility,
-) -> Tensor:
-    """Query q attends to key k iff q's row of the table names k's block and both tokens are valid.
-
-    Args:
-        queries, keys: blocks in sequence order.
-        query_mask: [b, q] bool.
-        key_mask: [b, k] bool.
-        table: the visibility table.
-
-    Returns:
-        [b, q, k] bool.
-    """
-    device = key_mask.device
-    rows = []
-    for query in queries:
-        row = visible_blocks(query.name, table)
-        sees = [torch.full((key.length,), key.name in row, device=device) for key in keys]
-        rows.append(torch.cat(sees).expand(query.length, -1))
-    return torch.cat(rows) & query_mask[:, :, None] & key_mask[:, None, :]
-
-
 def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
     """Rotary positions [b, n]: valid tokens are counted, padding repeats the number before it (−1
     first).
@@ -312,6 +285,28 @@ class MaskLayout(NamedTuple):
             rows[:, run, None].expand(-1, length, -1) for run, length in enumerate(self.lengths)
         ]
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+def attention_mask(
+    queries: Sequence[Span],
+    keys: Sequence[Span],
+    query_mask: Tensor,
+    key_mask: Tensor,
+    table: Visibility,
+) -> Tensor:
+    """Query q attends to key k iff q's row of the table names k's block and both tokens are valid.
+
+    Args:
+        queries, keys: blocks in sequence order.
+        query_mask: [b, q] bool.
+        key_mask: [b, k] bool.
+        table: the visibility table.
+
+    Returns:
+        [b, q, k] bool.
+    """
+    layout = MaskLayout.of(queries, keys, key_mask, table)
+    return layout.expand(layout.visible) & query_mask[:, :, None]
 
 
 BACKENDS = ("auto", "sdpa", "flex", "varlen")

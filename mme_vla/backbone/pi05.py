@@ -144,24 +144,6 @@ class Pi05Backbone(
             Block("prompt", words, batch.prompt_mask, "vlm"),
         ]
 
-    def action_block(self, x_t: Tensor) -> Block:
-        """The noisy chunk [b, h, a] as the block of the action expert."""
-        mask = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
-        return Block("action", self._float32_linear(self.action_in, x_t), mask, "action")
-
-    def time_condition(self, time: Tensor) -> Tensor:
-        """Condition [b, d_action] of the adaptive norms for flow times [b], in float32."""
-        x = time_embedding(time, self.config.action.width)
-        for layer in (self.time_in, self.time_out):
-            x = nn.functional.silu(float32_linear(layer, x))
-        return x
-
-    def read_velocity(self, hidden: Tensor) -> Tensor:
-        """The network's output [b, h, a] in float32, of `flow` a velocity, of `clean_flow` a chunk.
-        The last h tokens of [b, n, d] are the actions.
-        """
-        return self._float32_linear(self.action_out, hidden[:, -self.horizon :])
-
     # Training
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
@@ -174,11 +156,11 @@ class Pi05Backbone(
         return self.head.loss(self.predictor(batch, injection), batch.actions, noise)
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
-        return partial(self.velocity, injection)
+        return partial(self.predict, injection)
 
-    def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
-        """The network's output (`read_velocity`) [b, h, a] at noisy chunks x_t [b, h, a] and times
-        [b], in one joint pass.
+    def predict(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
+        """The network's output [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint
+        pass.
         """
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
         layout = self.transformer.layout(blocks, injection.visibility)
@@ -186,7 +168,25 @@ class Pi05Backbone(
         if injection.condition is not None:
             condition = injection.condition(condition)
         hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
-        return self.read_velocity(hidden)
+        return self.project_actions(hidden)
+
+    def action_block(self, x_t: Tensor) -> Block:
+        """The noisy chunk [b, h, a] as the block of the action expert."""
+        mask = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
+        return Block("action", self._float32_linear(self.action_in, x_t), mask, "action")
+
+    def time_condition(self, time: Tensor) -> Tensor:
+        """Condition [b, d_action] of the adaptive norms for flow times [b], in float32."""
+        x = time_embedding(time, self.config.action.width)
+        for layer in (self.time_in, self.time_out):
+            x = nn.functional.silu(float32_linear(layer, x))
+        return x
+
+    def project_actions(self, hidden: Tensor) -> Tensor:
+        """The network's output [b, h, a] in float32, which its head reads. The last h tokens of [b,
+        n, d] are the actions.
+        """
+        return self._float32_linear(self.action_out, hidden[:, -self.horizon :])
 
     # Sampling
 
@@ -232,13 +232,13 @@ class Pi05Backbone(
             ]
             conditions = self.transformer.conditioning(torch.cat(condition))
 
-        def output(x_t: Tensor, index: int) -> Tensor:
+        def predict(x_t: Tensor, index: int) -> Tensor:
             blocks = [*injection.beside, self.action_block(x_t)]
             condition = conditions.at(index, rows)
             hidden, _ = self.transformer(blocks, layout, condition, injection.hook, prefix)
-            return self.read_velocity(hidden)
+            return self.project_actions(hidden)
 
-        velocity = self.head.velocity(output, times, noise)
+        velocity = self.head.velocity(predict, times, noise)
         if batch.overlap is not None:
             from mme_vla.speed.rtc import rtc_guidance
 

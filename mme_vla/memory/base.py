@@ -146,8 +146,8 @@ class MemoryModule(nn.Module):
     def condition_on_prompt(
         self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
-        """A selection as the backbone reads it with a prompt: `condition` [b, n, d_vision] of its
-        vision tokens.
+        """A selection as the backbone reads it with a prompt: its vision tokens [b, n, d_vision]
+        through `condition` (`MMEModel.prompt_condition`).
         """
         if self.uses_proprio:  # its features are states and actions
             return history
@@ -412,22 +412,6 @@ class FeatureEncoder(nn.Module):
         return self.encode(features, self.embed_positions(positions) * mask[..., None])
 
 
-def check_scorer(memory: "Memory") -> None:
-    """Check that a cache stores scores under the key of the scorer that the memory makes.
-
-    Raises:
-        UserError: the keys differ, so that training and episodes would read different scores.
-    """
-    scorer = memory.make_scorer()
-    key = "" if scorer is None else scorer.key
-    require(
-        memory.storage.scorer == key,
-        f"{type(memory).__name__}: storage.scorer={brief(memory.storage.scorer)} is not the key of"
-        f" the scorer that make_scorer() returns ({brief(key)}), so a cache would hold the scores"
-        " of another rule. Pass StorageSpec(…, scorer=<that scorer>.key), with the same options.",
-    )
-
-
 class PerceptualMemory(MemoryModule):
     """Selected tokens, right-padded to the budget and encoded one by one; subclasses choose."""
 
@@ -462,3 +446,19 @@ class PerceptualMemory(MemoryModule):
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         tokens = self.encoder(history.features, history.positions, history.mask)
         return MemoryTokens(tokens, history.mask, ages=history.ages)
+
+
+def check_scorer(memory: "Memory") -> None:
+    """Check that a cache stores scores under the key of the scorer that the memory makes.
+
+    Raises:
+        UserError: the keys differ, so that training and episodes would read different scores.
+    """
+    scorer = memory.make_scorer()
+    key = "" if scorer is None else scorer.key
+    require(
+        memory.storage.scorer == key,
+        f"{type(memory).__name__}: storage.scorer={brief(memory.storage.scorer)} is not the key of"
+        f" the scorer that make_scorer() returns ({brief(key)}), so a cache would hold the scores"
+        " of another rule. Pass StorageSpec(…, scorer=<that scorer>.key), with the same options.",
+    )

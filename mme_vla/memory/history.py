@@ -398,8 +398,8 @@ class OnlineHistory(History):
 
 
 class PromptConditionedHistory(History):
-    """A history whose tokens are changed by `condition` [n, d_vision] → [n, d_vision] as they are
-    gathered.
+    """A history whose tokens are changed as they are gathered, by the `condition` of its prompt
+    (`MMEModel.prompt_condition`, of a batch of one).
     """
 
     def __init__(self, source: History, condition: Callable[[Tensor], Tensor]) -> None:
@@ -422,7 +422,7 @@ class PromptConditionedHistory(History):
         return self._source.stored_frames
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._condition(self._source.gather(indices))
+        return self._condition(self._source.gather(indices)[None])[0]
 
     def stored(self, indices: np.ndarray) -> Tensor:
         return self._source.stored(indices)

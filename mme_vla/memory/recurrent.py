@@ -337,53 +337,56 @@ class RecurrentMemory(MemoryModule):
     def run(self, x: Tensor, valid: Tensor) -> MemoryTokens:
         """Run the recurrence over encoded frames [b, t, p, d], of which `valid` [b, t] are real.
 
-        Gradients flow through every step. With `recompute` only the states between chunks are kept
-        for them.
+        The state begins as `initial`, every chunk of frames takes it through `advance`, and `read`
+        makes tokens of the last one. Gradients flow through every step.
         """
-        # Statistics are needed of one update in many: not worth compiling for.
-        compiled = None if self.reporting else self._compiled
-        is_compiling = torch.compiler.is_compiling()
-        advance = self.layer.advance if compiled is None else partial(compiled, self.layer)
-        step = advance
-        if not is_compiling:
-            # Within the step, which the backward pass computes again; a graph has no place for a
-            # switch of the process.
-            step = partial(_advance_with, self.float32_products, advance)
-        start = self.init_state(len(x))
-        # All chunks are laid out alike, whatever the window's length: they share one code.
-        state = tuple(tensor.contiguous() for tensor in start)
         # A CPU skips the windows that have no frame yet, unless `read` returns outputs of this
         # chunk. A GPU would synchronise to know which.
-        skips_empty = x.device.type == "cpu" and not (self.reporting or compiled or is_compiling)
+        skips_empty = x.device.type == "cpu" and not (
+            self.reporting or self._compiled or torch.compiler.is_compiling()
+        )
         window = self.layer.window
+        start = state = self.init_state(len(x))
         statistics = []
-        remaining = x.shape[1]
-        for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
-            remaining -= part.shape[1]
+        entered = 0
+        for frames, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
+            entered += frames.shape[1]
+            remaining = x.shape[1] - entered
             following = remaining if window is None else min(remaining, window)
-            rows = None
-            if skips_empty and window is not None and remaining >= window:
-                rows = valid[:, : x.shape[1] - remaining].any(1).nonzero()[:, 0]
-            inputs = (*state, part, real)
-            if rows is not None:
-                inputs = tuple(tensor[rows] for tensor in inputs)
-            *entering, part, real = (tensor.contiguous() for tensor in inputs)
-            arguments = (tuple(entering), part, real, following, self.reporting)
-            if torch.is_grad_enabled() and self.recompute:
-                updated, numbers = checkpoint(
-                    step, *arguments, use_reentrant=False, preserve_rng_state=False
-                )
-            else:
-                updated, numbers = step(*arguments)
-            if rows is not None:
+            if skips_empty and following == window:
+                rows = valid[:, :entered].any(1).nonzero()[:, 0]
+                of_rows = [tensor[rows] for tensor in state]
+                updated, numbers = self._advance(of_rows, frames[rows], real[rows], following)
                 pairs = zip(state, updated, strict=True)
-                updated = tuple(old.index_copy(0, rows, new) for old, new in pairs)
-            state = updated
+                state = tuple(old.index_copy(0, rows, new) for old, new in pairs)
+            else:
+                state, numbers = self._advance(state, frames, real, following)
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
             tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
         return tokens
+
+    def _advance(
+        self, state: Sequence[Tensor], frames: Tensor, valid: Tensor, following: int
+    ) -> tuple[State, Statistics]:
+        """`RecurrentLayer.advance` over one chunk, compiled after `compile`. With `recompute` only
+        what enters it is kept for the backward pass.
+        """
+        advance = self.layer.advance
+        if self._compiled is not None and not self.reporting:
+            # Statistics are needed of one update in many: not worth compiling for.
+            advance = partial(self._compiled, self.layer)
+        if not torch.compiler.is_compiling():
+            # Within the step, which the backward pass computes again; a graph has no place for a
+            # switch of the process.
+            advance = partial(_advance_with, self.float32_products, advance)
+        # All chunks are laid out alike, whatever the window's length: they share one code.
+        *entering, frames, valid = (tensor.contiguous() for tensor in (*state, frames, valid))
+        arguments = (tuple(entering), frames, valid, following, self.reporting)
+        if torch.is_grad_enabled() and self.recompute:
+            return checkpoint(advance, *arguments, use_reentrant=False, preserve_rng_state=False)
+        return advance(*arguments)
 
     def compile(self, **options: Any) -> None:
         """Compile the steps of a chunk, whose number does not depend on how long a window is."""

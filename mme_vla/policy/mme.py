@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -65,7 +64,9 @@ class MMEPolicy(NetworkPolicy):
     """One composition of backbone, memory and integration, as a policy. No method depends on the
     variant.
 
-    model: the network. Its modules `backbone`, `memory` and `integration` are the policy's own too.
+    model: the network. Policy and model share the modules `backbone`, `memory` and `integration`:
+        names of weights have no prefix, and a part that is replaced in one is replaced in both.
+        `compute_dtype`, `loss_weights` and the mode of training are the model's.
     """
 
     model: MMEModel
@@ -96,9 +97,9 @@ class MMEPolicy(NetworkPolicy):
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32:
                 `ieee` or `tf32`.
         """
+        # The model is no submodule: the policy shares its table of modules, see above. It comes
+        # before `super().__init__`, which sets `compute_dtype`.
         model = MMEModel(backbone, memory, integration, transform_images=self.transform_images)
-        # Before `super().__init__`, whose `compute_dtype` the model keeps; `nn.Module` refuses to
-        # register a module that early.
         object.__setattr__(self, "model", model)
         super().__init__(
             processor,
@@ -107,8 +108,6 @@ class MMEPolicy(NetworkPolicy):
             history_dtype=history_dtype,
             augment=augment,
         )
-        # The model's modules are the policy's, so that the names of weights have no prefix and a
-        # part that is replaced in one is replaced in both.
         self._modules = model._modules
         self.horizon = backbone.horizon
         self.action_dim = backbone.action_dim
@@ -252,24 +251,27 @@ class MMEPolicy(NetworkPolicy):
                 "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
                 " None)."
             )
+        # The random numbers of the loss and of the augmentation: as given, the others sampled.
         count, generator = len(batch.actions), torch.default_generator
-        values = named_noise(noise, time=time)
+        draws = named_noise(noise, time=time)
         is_complete = isinstance(noise, Mapping) or (noise is not None and time is not None)
-        if not values or not is_complete:
-            values = self.training_noise(count, generator) | values
-        if "changes" not in values:
-            values = self.augmentation_params(count, generator) | values
-        values = map_noise(values, lambda value: value.to(self.device))
-        augmentation = values.pop("changes", None)
+        if not draws or not is_complete:
+            draws = self.training_noise(count, generator) | draws
+        if "changes" not in draws:
+            draws = self.augmentation_params(count, generator) | draws
+        draws = map_noise(draws, lambda value: value.to(self.device))
+        augmentation = draws.pop("changes", None)
+
         metrics: dict[str, Tensor] = {}
-        loss = self.model.loss(batch, values, memory, augmentation, metrics)
+        loss = self.model.loss(batch, draws, memory, augmentation, metrics)
         return loss, metrics
 
-    def velocity(
+    def predict(
         self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None
     ) -> Tensor:
-        """The network's output [b, h, a] of a flow backbone, of `flow` a velocity, at noisy chunks
-        x_t [b, h, a] and times [b], in one pass.
+        """The network's output [b, h, a] of a backbone with a flow head, at noisy chunks x_t [b, h,
+        a] and times [b], in one pass. The head `flow` reads it as a velocity, `clean_flow` as a
+        chunk.
         """
         assert isinstance(self.backbone, HasFlowHead)
         if memory is None:
@@ -442,7 +444,7 @@ class MMEPolicy(NetworkPolicy):
         with self.autocast():
             histories = []
             for i, episode in enumerate(episodes):
-                condition = partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i])
+                condition = self.model.prompt_condition(batch.rows(slice(i, i + 1)))
                 history = PromptConditionedHistory(episode.required_history(), condition)
                 episode.read = history
                 histories.append(history)
@@ -460,10 +462,6 @@ class MMEPolicy(NetworkPolicy):
         if self.memory is None:
             return np.zeros(0, np.int64)
         return self.memory.frames_read(steps, exec_start)
-
-    def _condition_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
-        """Stored tokens [n, d_vision] of one episode, read with its prompt [l]."""
-        return self.backbone.condition_on_prompt(tokens[None], prompt[None], prompt_mask[None])[0]
 
     @property
     def memory_tower(self) -> MemoryTower:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mme_vla.backbone.flow import FlowHead, HasFlowHead
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import open_gates, random_batch, tiny_sections
@@ -119,15 +120,33 @@ def check_sampling(policy: MMEPolicy, batch: Batch, memory: MemoryTokens) -> Non
     for steps in (1, 2):  # as many as samples, too: a step must not be taken for a sample
         chunk = policy.sample_actions(batch, draws, steps=steps, memory=memory)
         assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
-        if "noise" in draws:  # Euler's way from noise at time 1, each velocity in one joint pass
-            joint = draws["noise"]
-            for i in range(steps):
-                time = torch.full((2,), 1 - i / steps)
-                joint = joint - policy.velocity(batch, joint, time, memory) / steps
+        if isinstance(policy.backbone, HasFlowHead):
+            joint = sample_jointly(policy, policy.backbone.head, batch, draws, steps, memory)
             error = float((chunk - joint).abs().max())
             assert error <= TOLERANCE, (
                 f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
             )
+
+
+def sample_jointly(
+    policy: MMEPolicy,
+    head: FlowHead,
+    batch: Batch,
+    draws: dict[str, Tensor],
+    steps: int,
+    memory: MemoryTokens,
+) -> Tensor:
+    """A chunk [b, h, a] by the head's Euler steps, each of which runs the network in one pass."""
+    x = head.start(draws, steps, None)
+    times = head.times(steps, x.device)
+
+    def predict(x_t: Tensor, index: int) -> Tensor:
+        return policy.predict(batch, x_t, times[index].expand(len(x_t)), memory)
+
+    velocity = head.velocity(predict, times, draws)
+    for index in range(len(times)):
+        x = head.step(x, velocity(x, index), len(times))
+    return x
 
 
 def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -> None:

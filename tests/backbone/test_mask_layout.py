@@ -29,9 +29,13 @@ from mme_vla.testing.small import random_batch, small_policy
 def test_what_a_valid_token_sees_is_what_the_table_says(table: Visibility) -> None:
     spans = blocks_of(table)
     valid = validity(sum(span.length for span in spans))
-    expected = attention_mask(spans, spans, valid, valid, table)
+    rows = []
+    for query in spans:
+        sees = [torch.full((key.length,), key.name in table[query.name]) for key in spans]
+        rows.append(torch.cat(sees).expand(query.length, -1))
+    expected = torch.cat(rows) & valid[:, :, None] & valid[:, None, :]
+    assert torch.equal(attention_mask(spans, spans, valid, valid, table), expected)
     layout = MaskLayout.of(spans, spans, valid, table)
-    assert torch.equal(layout.expand(layout.visible) & valid[:, :, None], expected)
     assert sum(layout.lengths) == valid.shape[1] and len(layout.lengths) <= len(spans)
 
 
@@ -100,12 +104,15 @@ def test_what_padding_asks_changes_no_loss_no_gradient_and_no_chunk(
         )
 
     now = results()
+    layout_of = MaskLayout.of
 
     def as_it_was(
         spans: list[Span], keys: list[Span], valid: Tensor, table: Visibility
     ) -> MaskLayout:
         asking = valid[:, -sum(span.length for span in spans) :]
-        return MaskLayout((1,) * asking.shape[1], attention_mask(spans, keys, asking, valid, table))
+        layout = layout_of(spans, keys, valid, table)
+        rows = layout.expand(layout.visible) & asking[:, :, None]
+        return MaskLayout((1,) * asking.shape[1], rows)
 
     monkeypatch.setattr(gemma.MaskLayout, "of", as_it_was)
     monkeypatch.setattr(layers, "BIG_NEGATIVE", -2.3819763e38)

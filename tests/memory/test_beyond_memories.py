@@ -368,8 +368,10 @@ def test_what_the_robot_did_is_no_vision_token_and_is_not_highlighted_beside_a_p
         policy = small_policy(name, memory=memory, backbone=FEW_TOKENS)
         policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
         batch = random_batch(policy, valid=96)
-        history = policy.model.conditioned_history(batch)
-        assert batch.history is not None and history is not None
+        assert batch.history is not None
+        history = policy.require_memory().condition_on_prompt(
+            batch.history, policy.model.prompt_condition(batch)
+        )
         # The actions' rows come first, for they are padded on the left.
         features, n_local = (
             batch.history.features,

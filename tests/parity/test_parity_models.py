@@ -54,7 +54,7 @@ def test_velocity_and_loss_equal_the_released_model(case):
         assert golden.error(memory.tokens, tensors["out/mem_tokens"]) <= TOLERANCE
         assert torch.equal(memory.mask, tensors["out/mem_mask"])
     time, noise = tensors["in/time"], tensors["in/noise"]
-    velocity = policy.velocity(batch, tensors["out/x_t"], time, memory)
+    velocity = policy.predict(batch, tensors["out/x_t"], time, memory)
     assert golden.error(velocity, tensors["out/v_t"]) <= TOLERANCE
     loss, _ = policy(batch, noise, time, memory)
     assert abs(float(loss) - float(tensors["out/loss"].mean())) <= TOLERANCE
@@ -78,7 +78,7 @@ def test_rmt_rounds_where_the_released_model_does(integration, parity):
     policy, tensors, about = loaded(parity, f"model_recurrent-rmt-{integration}")
     batch, memory = golden.batch(tensors), golden.memory_tokens(policy, tensors)
     assert golden.error(memory.tokens, tensors["out/mem_tokens"]) <= ROUNDED_TOLERANCE
-    velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
+    velocity = policy.predict(batch, tensors["out/x_t"], tensors["in/time"], memory)
     assert golden.error(velocity, tensors["out/v_t"]) <= ROUNDED_TOLERANCE
     sampled = policy.sample_actions(
         batch, tensors["in/sample_noise"], about["num_denoise_steps"], memory=memory
@@ -97,7 +97,7 @@ def test_bfloat16_stays_near_the_released_model(case):
         policy.to(dtype)
         with policy.autocast():
             batch, memory = golden.batch(tensors), golden.memory_tokens(policy, tensors)
-            velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
+            velocity = policy.predict(batch, tensors["out/x_t"], tensors["in/time"], memory)
             noise = tensors["in/sample_noise"]
             sampled = policy.sample_actions(batch, noise, about["num_denoise_steps"], memory=memory)
         for actual, expected in (

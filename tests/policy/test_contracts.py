@@ -17,7 +17,8 @@ from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import History
 from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES
 from mme_vla.testing import check_backbone, check_integration, check_memory, check_task
-from mme_vla.testing.small import tiny_sections
+from mme_vla.testing.check_integration import check_sampling
+from mme_vla.testing.small import random_batch, small_policy, tiny_sections
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 SIZES: dict[str, dict[str, Any]] = {
@@ -59,6 +60,16 @@ def test_every_integration_of_the_library_keeps_an_integrations_contract(
 ) -> None:
     check_integration(name)
     assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [name] * 4
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("head", ["flow", "clean_flow"])
+def test_sampling_is_compared_to_the_joint_pass_through_the_head_of_the_backbone(head: str) -> None:
+    policy = small_policy("framesamp_modul", **{"backbone.head.name": head})
+    batch = random_batch(policy, batch=2, valid=64)
+    memory = policy.model.memory_tokens(batch)
+    assert memory is not None
+    check_sampling(policy, batch, memory)
 
 
 def test_the_backbone_of_the_library_keeps_a_backbones_contract() -> None:

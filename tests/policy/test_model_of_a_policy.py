@@ -3,9 +3,12 @@ sampled chunk.
 """
 
 import copy
+import re
+import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -14,7 +17,7 @@ import torch
 
 from mme_vla import MMEPolicy, UserError
 from mme_vla.memory.base import stack_history
-from mme_vla.model import unit_images
+from mme_vla.model import MMEModel, unit_images
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 
 
@@ -73,14 +76,14 @@ def test_missing_noise_is_sampled(policy: MMEPolicy) -> None:
 def test_a_chunk_takes_six_calls_in_four_files(
     policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read_velocity: Callable[..., Any] = policy.backbone.read_velocity
+    project_actions: Callable[..., Any] = policy.backbone.project_actions
     stacks: list[traceback.StackSummary] = []
 
     def watched(hidden: torch.Tensor) -> torch.Tensor:
         stacks.append(traceback.extract_stack())
-        return read_velocity(hidden)
+        return project_actions(hidden)
 
-    monkeypatch.setattr(policy.backbone, "read_velocity", watched)
+    monkeypatch.setattr(policy.backbone, "project_actions", watched)
     episode = policy.start_episode("press the button")
     frames = moving_frames(1)
     episode.observe({"front": frames, "wrist": frames}, np.zeros((1, 8), np.float32))
@@ -94,9 +97,30 @@ def test_a_chunk_takes_six_calls_in_four_files(
         "sample_actions",
         "sample",  # of the model
         "sample",  # of the backbone, which has the Euler steps
-        "output",
+        "predict",
     ]
     assert len({frame.filename for frame in calls}) == 4
+
+
+def test_the_model_lists_the_calls_of_a_loss_in_their_order() -> None:
+    policy = small_policy("framesamp_modul")
+    batch = random_batch(policy, valid=64)
+    noise = policy.training_noise(2, torch.Generator().manual_seed(0))
+    called: dict[str, None] = {}
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            called.setdefault(frame.f_code.co_qualname)
+
+    sys.setprofile(note)
+    try:
+        policy.model.loss(batch, noise)
+    finally:
+        sys.setprofile(None)
+    page = sys.modules[MMEModel.__module__].__doc__ or ""
+    listed = re.findall(r"^    ([\w.]+) +(?:here|\w+/\w+\.py): ", page, re.MULTILINE)
+    assert len(listed) == 12
+    assert listed == [name for name in called if name in listed]
 
 
 def test_a_model_without_a_transform_refuses_augmentation() -> None:

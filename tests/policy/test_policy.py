@@ -40,7 +40,7 @@ def remembering(request):
 def velocity(policy, batch, seed=1):
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(batch.actions.shape, generator=generator)
-    return policy.velocity(batch, noise, torch.full((len(noise),), 0.6))
+    return policy.predict(batch, noise, torch.full((len(noise),), 0.6))
 
 
 @torch.no_grad()
@@ -54,8 +54,8 @@ def test_cached_prefix_equals_the_joint_pass(policy):
     layout = transformer.layout([action], policy.integration.visibility, prefix)
     condition = policy.backbone.time_condition(time_)
     hidden, _ = transformer([action], layout, condition, injection.hook, prefix)
-    cached = policy.backbone.read_velocity(hidden)
-    assert (cached - policy.velocity(batch, noise, time_)).abs().max() < TOLERANCE
+    cached = policy.backbone.project_actions(hidden)
+    assert (cached - policy.predict(batch, noise, time_)).abs().max() < TOLERANCE
 
 
 def test_masked_history_cannot_change_the_action(remembering):
@@ -107,7 +107,7 @@ def test_batch_equals_each_alone(policy):
             i : i + 1
         ]
         with torch.no_grad():
-            one = policy.velocity(alone, noise, torch.full((1,), 0.6))
+            one = policy.predict(alone, noise, torch.full((1,), 0.6))
         assert (one - together[i : i + 1]).abs().max() < TOLERANCE
 
 

@@ -39,7 +39,7 @@ def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> T
         hidden, _ = backbone.transformer(
             action, layout, conditions.at(index), injection.hook, prefix
         )
-        x = x - backbone.read_velocity(hidden) / steps
+        x = x - backbone.project_actions(hidden) / steps
     return x
 
 

@@ -77,7 +77,7 @@ def test_a_checkpoint_of_orbax_reproduces_the_golden_outputs(parity: Path) -> No
         parameter.zero_()
     load_weights(policy, RUN)
     batch, memory = golden.batch(tensors), golden.memory_tokens(policy, tensors)
-    velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
+    velocity = policy.predict(batch, tensors["out/x_t"], tensors["in/time"], memory)
     assert golden.error(velocity, tensors["out/v_t"]) < 1e-4
     chunk = policy.sample_actions(batch, tensors["in/sample_noise"], memory=memory)
     assert golden.error(chunk, tensors["out/sampled_actions"]) < 1e-4

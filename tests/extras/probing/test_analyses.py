@@ -78,7 +78,7 @@ def test_the_cached_and_the_joint_pass_show_the_same_attention() -> None:
     with AttentionWatch(policy) as sampled:
         policy.sample_actions(batch, noise, steps=1)
     with AttentionWatch(policy) as joint, torch.no_grad():
-        policy.velocity(batch, noise, torch.ones(2))
+        policy.predict(batch, noise, torch.ones(2))
     assert sampled.result().layers == pytest.approx(joint.result().layers, abs=1e-5)
 
 
