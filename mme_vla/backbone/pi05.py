@@ -215,27 +215,29 @@ class Pi05Backbone(
 
         # Prefill: one pass over images, prompt and memory leaves their keys and values in a cache
         # with space for a step's own.
-        blocks = [*injection.beside, self.action_block(x)]
-        space = self.transformer.cache_space(injection.blocks, sum(len(block) for block in blocks))
-        layout = self.transformer.layout(injection.blocks, injection.visibility)
-        _, prefix = self.transformer(injection.blocks, layout, past=space, keep=True)
+        step_blocks = [*injection.beside, self.action_block(x)]  # for their lengths and masks
+        step_length = sum(len(block) for block in step_blocks)
+        space = self.transformer.cache_space(injection.blocks, step_length)
+        prefix_layout = self.transformer.layout(injection.blocks, injection.visibility)
+        _, prefix = self.transformer(injection.blocks, prefix_layout, past=space, keep=True)
 
         # What all steps share: mask and angles, and the time modulations of every layer.
-        layout = self.transformer.layout(blocks, injection.visibility, prefix)
+        step_layout = self.transformer.layout(step_blocks, injection.visibility, prefix)
         if injection.condition is None:
             rows = 1
             conditions = self.conditions(len(times))
         else:  # memory changes the condition of each sample: every time for each
             rows = len(x)
-            condition = [
+            changed = [
                 injection.condition(time.expand(rows, -1)) for time in self.time_condition(times)
             ]
-            conditions = self.transformer.conditioning(torch.cat(condition))
+            conditions = self.transformer.conditioning(torch.cat(changed))
 
         def predict(x_t: Tensor, index: int) -> Tensor:
+            # Its keys and values go behind the prefix, where the next step overwrites them.
             blocks = [*injection.beside, self.action_block(x_t)]
             condition = conditions.at(index, rows)
-            hidden, _ = self.transformer(blocks, layout, condition, injection.hook, prefix)
+            hidden, _ = self.transformer(blocks, step_layout, condition, injection.hook, prefix)
             return self.project_actions(hidden)
 
         velocity = self.head.velocity(predict, times, noise)
