@@ -146,7 +146,7 @@ def _rows_of(
         run(["train", "env=mikasa", f"data.sources=[{data}]", *words])
 
     # Both continue what an interruption left, and repeat nothing.
-    closed_loop = ["env=mikasa", f"checkpoint={training}", tasks]
+    closed_loop = ["env=mikasa", f"checkpoint={training}", tasks, "execute=8"]
     evaluated = folder / "evaluation" / name
     run([
         "evaluate", *closed_loop, f"episodes={args.episodes}", f"max_steps={args.most_steps}",
@@ -154,7 +154,7 @@ def _rows_of(
     ])  # fmt: skip
     twins = folder / "twins" / name
     run([
-        "probe", "twins", *closed_loop, f"episodes={args.pairs}", "execute=8", f"output={twins}",
+        "probe", "twins", *closed_loop, f"episodes={args.pairs}", f"output={twins}",
     ])  # fmt: skip
 
     # A memory that keeps frames keeps the same ones whatever it has learned.
