@@ -70,3 +70,19 @@ def test_an_interrupted_recording_continues_with_the_missing_episodes(
     }
     with pytest.raises(UserError, match="exists already"):
         record_environment(config)
+
+
+def test_a_recording_has_the_robots_names_of_an_action(
+    demonstrated: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = type(environment("blink"))
+    action = kind.embodiment["action"]
+    names = [f"joint {number} of mine" for number in range(action["width"])]
+    named = {**kind.embodiment, "action": {**action, "names": names}}
+    root = tmp_path / "data"
+    monkeypatch.setattr(kind, "embodiment", named)
+    words = {"env": "blink", "tasks": "all", "task": None, "split": "train", "fps": 20}
+    record_environment(OmegaConf.create({**words, "output": str(root), "episodes": 1}))
+    features = read_json(root / "meta" / "info.json", "a dataset")["features"]
+    assert features["action"]["names"] == names
+    assert features["observation.state"]["names"][0] == "state 0"

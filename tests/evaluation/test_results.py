@@ -658,3 +658,31 @@ def test_a_name_with_dollar_signs_is_text_in_the_figures(tmp_path: Path) -> None
         ]
     )
     assert r"$\nonsense$" in (tmp_path / "page.html").read_text()
+
+
+def test_a_comparison_of_memories_names_the_baselines_that_it_lacks() -> None:
+    def notes(*models: str) -> list[str]:
+        made: list[EpisodeRecord] = []
+        for model in models:
+            made += records(model, {"BinFill": [1, 0, 0, 0], "MoveCube": [0, 0, 0, 0]})
+        return [note for note in aggregate(made, SMALL).notes if "in this table" in note]
+
+    assert notes("framesamp_expert", "pi05") == [
+        "No present_* in this table, whose memory holds the current frame alone: train"
+        " present_expert to compare.",
+        "No actions_* in this table, whose memory holds the robot's own past actions: train"
+        " actions_expert to compare.",
+    ]
+    assert len(notes("framesamp_modul", "present_modul")) == 1
+    assert notes("framesamp_modul", "present_modul", "actions_modul") == []
+    assert notes("framesamp_modul") == notes("pi05", "groundsg") == []
+
+
+def test_standing_baselines_are_below_a_line_in_the_tables() -> None:
+    made: list[EpisodeRecord] = []
+    for model in ("present_modul", "framesamp_modul", "actions_modul", "pi05"):
+        made += records(model, {"BinFill": [1, 0, 0, 0], "MoveCube": [0, 0, 0, 0]})
+    table = overview(aggregate(made, SMALL))
+    names = [row[0] for row in table.rows]
+    assert names == ["framesamp_modul", "pi05", "present_modul", "actions_modul"]
+    assert table.rules == {2}

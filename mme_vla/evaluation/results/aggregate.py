@@ -26,6 +26,7 @@ from mme_vla.evaluation.records import (
     merge,
 )
 from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results.baselines import is_standing, missing_baselines
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
 from mme_vla.evaluation.results.scopes import (
     MAX_STEPS,
@@ -284,6 +285,7 @@ def aggregate(
     table = record_table(included)
     table["method"] = [_method_key(run) for run in table["run"]]
     methods = [_method(members, protocol) for _, members in table.groupby("method", sort=False)]
+    methods.sort(key=lambda method: is_standing(method.model))  # last in every table
     repeats = repeated_episodes(records)
     for method in methods:
         for run in method.runs:
@@ -535,4 +537,4 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
         notes.append(
             f"Left out: {counted(outside, 'record')} of other tasks, or of other episodes."
         )
-    return notes
+    return notes + missing_baselines(method.model for method in methods)

@@ -10,6 +10,7 @@ import pandas as pd
 from mme_vla.errors import counted, printable
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
+from mme_vla.evaluation.results.baselines import is_standing
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import GROUPING, PAPER_SEEDS, scopes
 from mme_vla.evaluation.results.statistics import Interval
@@ -127,7 +128,13 @@ def overview(results: Results) -> Table:
     title = "Success rate (%)"
     if any(len(method.runs) > 1 for method in results.methods):
         title += f", mean ± sample standard deviation over {over}"
-    return Table(title, columns, rows)
+    return Table(title, columns, rows, _before_baselines(results))
+
+
+def _before_baselines(results: Results) -> set[int]:
+    """The first row of a standing baseline, where other methods stand above it."""
+    standing = [is_standing(method.model) for method in results.methods]
+    return {standing.index(True)} if len(set(standing)) == 2 else set()
 
 
 def grouping_tables(results: Results) -> list[Table]:
@@ -142,7 +149,8 @@ def grouping_tables(results: Results) -> list[Table]:
             for group in groups:
                 row.append(show(figures[group]) if group in figures else "")
             rows.append(row)
-        tables.append(Table(f"Success rate (%) by {title}", ["method", *groups], rows))
+        rules = _before_baselines(results)
+        tables.append(Table(f"Success rate (%) by {title}", ["method", *groups], rows, rules))
     return tables
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mme_vla.errors import counted, listed
+from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.compare import show_p
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
@@ -229,6 +230,7 @@ def notes(board: Board) -> list[str]:
                 f"{row.name}: {counted(errors, 'failure')} by an error of the environment or the"
                 " policy."
             )
+    lines += missing_baselines(row.name for row in board.rows)
     recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
     if len(recordings) > 1:
         several = sum(len(row.recordings) > 1 for row in board.rows)

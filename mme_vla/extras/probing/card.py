@@ -14,6 +14,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, display_name
+from mme_vla.evaluation.results.baselines import is_standing, memory_of
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol, counted
 from mme_vla.evaluation.results.statistics import (
@@ -52,6 +53,12 @@ NEGLIGIBLE = 0.01
 of 0.
 """
 AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
+MEMORYLESS = "memoryless"  # the reference that was trained without memory
+NOT_MEMORYLESS = (
+    "“nothing remembered” is this policy with its memory taken away, which is not a memoryless"
+    " policy: it was trained to rely on a memory."
+)
+"""What that arm is not, for pages."""
 MARK = "Report card of"  # in the heading of each page
 _SAMPLES = 10_000  # of the bootstrap
 LOSS = (
@@ -63,6 +70,7 @@ LOSS = (
 """What a loss is, for pages."""
 _METHOD = (
     f"Every arm runs the scenes of the matched run with its noise. {LOSS}",
+    NOT_MEMORYLESS,
     (
         "The memory-or-clock score is the loss under time shift / (that loss + the loss under"
         " content swap): 1 where a policy reads only time, 0 where it reads only content. It is"
@@ -193,7 +201,7 @@ def measure_card(
         plan: its jobs are the scenes, its recordings those that recovery is measured on, `lend`
             those to take contents from.
         references: name → folder of records, floors and ceilings such as `{"demonstrator":
-            "outputs/…"}`.
+            "outputs/…"}`. `memoryless` is a policy that was trained without memory.
         interventions: label → intervention.
     """
     channel = channel_of(policy)
@@ -209,6 +217,13 @@ def measure_card(
         else:
             notes.append(f"{label} ({interventions[label]}) was left out: it needs {why}.")
     others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
+    if MEMORYLESS in others:
+        _check_memoryless(others[MEMORYLESS])
+    else:
+        notes.append(
+            f"{NOT_MEMORYLESS} Train one alike (such as present_modul or pi05), evaluate it on"
+            f" these scenes and name its records: references={{{MEMORYLESS}: <folder>}}."
+        )
 
     # In closed loop: every arm, then the matched run again with other noise.
     plan = replace(plan, arms=[interventions[label] for label in possible], events=())
@@ -408,6 +423,17 @@ def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
     return records
 
 
+def _check_memoryless(scenes: Scenes) -> None:
+    """Refuse records of a policy that remembers what it saw."""
+    for records in scenes.values():
+        for record in records:
+            require(
+                not memory_of(record.model) or is_standing(record.model),
+                f"references.{MEMORYLESS} holds records of {record.model}, which has a memory: name"
+                " those of present_*, actions_* or pi05, or give the reference another name.",
+            )
+
+
 def _mean(values: Outcomes) -> float:
     """Mean over tasks of the means over their scenes."""
     return float(np.mean([of_task.mean() for of_task in _by_task(values).values()]))
@@ -507,6 +533,8 @@ def conclude_card(card: Card) -> str:
         if label in card.arms:
             losses.append(f"{label} entries cost {100 * card.arms[label].loss:.0f} points")
     text = f"This policy solves {percent(card.matched)} of {scenes}"
+    if card.references and MEMORYLESS in card.references:
+        text += f" (a memoryless training {percent(card.references[MEMORYLESS])})"
     if losses:
         text += f", {' and '.join(losses)}"
     if score.score is None or score.low is None or score.high is None:

@@ -138,6 +138,9 @@ class Exchanged(History):
     def __init__(self, full: History, places: Mapping[int, Place]) -> None:
         super().__init__(full.spec, full.exec_start)
         self._full_history, self._places = full, places
+        if full.motion is not None:
+            self.motion = self._motion
+            self.state_width = full.state_width
 
     def __len__(self) -> int:
         return len(self._full_history)
@@ -145,6 +148,17 @@ class Exchanged(History):
     @property
     def scores(self) -> FrameScores:
         return self._full_history.scores
+
+    def proprio(self, frames: np.ndarray) -> Tensor:
+        """The episode's own, by which a memory chooses frames, as by `scores`."""
+        return self._full_history.proprio(frames)
+
+    def _motion(self, frames: np.ndarray) -> Tensor:
+        rows = []
+        for frame in frames.tolist():
+            history, its = self._places.get(frame, (self._full_history, frame))
+            rows.append(history.motion_rows(np.array([its], np.int64)))
+        return torch.cat(rows) if rows else self._full_history.motion_rows(frames)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         parts = []

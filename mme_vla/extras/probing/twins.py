@@ -396,6 +396,10 @@ def run_twins(
     why = lacking(off, policy, channel_of(policy), 0, boundaries=False)
     if why is None:
         policies[MEMORY_OFF] = ProbedPolicy(policy, off).eval()
+        notes.append(
+            f"{MEMORY_OFF} is this policy with its memory taken away, not a memoryless one: train"
+            " present_modul or pi05 to compare."
+        )
     else:
         notes.append(f"{MEMORY_OFF} was left out: it needs {why}.")
     claim_run(folder, run_settings(policy, facts, settings, None, options.source))

@@ -615,6 +615,16 @@ def test_errors_of_episodes_are_counted_beside_the_table(rows: Path, tmp_path: P
     )
 
 
+def test_a_board_names_the_standing_baselines_that_it_lacks(tmp_path: Path) -> None:
+    for name in ("framesamp_modul", "present_modul"):
+        write_training(tmp_path, name, 0, 1)
+    notes = board_page.notes(Board(read_rows([tmp_path]), samples=20))
+    assert [line for line in notes if "in this table" in line] == [
+        "No actions_* in this table, whose memory holds the robot's own past actions: train"
+        " actions_modul to compare."
+    ]
+
+
 def test_a_trained_row_without_memory_is_a_floor_under_any_name(rows: Path, tmp_path: Path) -> None:
     write_training(tmp_path, "wide_pi05", 0, 3, budget=None)
     board = Board(read_rows([rows, tmp_path]), samples=50)

@@ -15,6 +15,7 @@ from helpers.published import published_folder
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, records, roll, use_inline_envs
 from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError
 from mme_vla.evaluation.receipts import verify
 from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.evaluation.rollout.evaluation import RunOptions
@@ -323,9 +324,8 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     options = RunOptions(base=make_choice_env)
     card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), options)
-    assert card.recovery is None and card.notes == [
-        "wrong scene first (distract:1) was left out: it needs a camera."
-    ]
+    assert card.recovery is None
+    assert card.notes[0] == "wrong scene first (distract:1) was left out: it needs a camera."
     assert all("distract:1" not in plan.arms for plan in plans)
 
 
@@ -344,3 +344,32 @@ def test_a_card_runs_every_arm_and_resumes(tmp_path: Path, monkeypatch: pytest.M
     again = run_card(policy, plan, tmp_path, facts, settings, options, references)
     assert again.arms == card.arms
     assert again.references == {"floor": card.arms["nothing remembered"].success}
+
+
+def test_a_card_tells_memory_off_from_memoryless_and_takes_a_memoryless_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(card_module, "run_probe", lambda *_, **__: None)
+    monkeypatch.setattr(card_module, "run_episodes", lambda *_, **__: None)
+    models = {"memoryless": "present_modul", "wrong": "framesamp_modul"}
+
+    def ended(folder: Path, plan: ProbePlan) -> dict[EpisodeKey, list[Any]]:
+        outcomes = [0, 1] if folder.name in models else [1, 1]
+        made = records("test", outcomes)
+        named = [replace(one, model=models.get(folder.name, one.model)) for one in made]
+        return {EpisodeKey(one.task, one.episode): [one] for one in named}
+
+    monkeypatch.setattr(card_module, "ended_scenes", ended)
+    donors = recordings()
+    plan = ProbePlan(None, (), donors, JOBS[:2], OfflineSettings(1, 2))
+    options = RunOptions(base=make_choice_env)
+    rest = (plan, tmp_path, FACTS, RolloutSettings(), options)
+    alone = run_card(reader(TIME), *rest)
+    assert any("references={memoryless: <folder>}" in note for note in alone.notes)
+    beside = run_card(reader(TIME), *rest, {"memoryless": str(tmp_path / "memoryless")})
+    assert not any("references=" in note for note in beside.notes)
+    assert beside.references == {"memoryless": 0.5}
+    assert "(a memoryless training 50 %)" in conclude_card(beside)
+    assert "which is not a memoryless policy" in (tmp_path / "card.html").read_text()
+    with pytest.raises(UserError, match="holds records of framesamp_modul, which has a memory"):
+        run_card(reader(TIME), *rest, {"memoryless": str(tmp_path / "wrong")})

@@ -213,6 +213,7 @@ def test_a_policy_without_its_memory_is_never_right_in_both(blink: str, tmp_path
     settings = RolloutSettings(env=blink, seed=7, flow_steps=2)
     twins = run_twins(policy, SCENES[:4], tmp_path, FACTS, settings, SILENT)
     assert twins.total[MEMORY_OFF].accuracy == 0 and twins.total[MEMORY_OFF].pairs == 4
+    assert any("not a memoryless one" in note for note in twins.notes)
 
 
 def test_a_stopped_measurement_continues(blink: str, tmp_path: Path) -> None:

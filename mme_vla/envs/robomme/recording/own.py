@@ -74,7 +74,9 @@ def record_own(
             for frame in range(length):
                 row = {name: column[frame] for name, column in columns.items()}
                 if dataset is None:
-                    dataset = _create(row, draft, fps)
+                    robot = environment.embodiment or {}
+                    names = robot.get("action", {}).get("names")
+                    dataset = _create(row, draft, fps, names)
                 dataset.add_frame({**row, "task": goal})
             dataset.save_episode()
             frames += length
@@ -114,7 +116,13 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
         env.close()
 
 
-def _create(row: dict[str, Any], root: Path, fps: int) -> Any:
+def _create(
+    row: dict[str, Any], root: Path, fps: int, action_names: Sequence[str] | None = None
+) -> Any:
+    """A new dataset with the columns of a row.
+
+    action_names: what the robot calls the numbers of its action, if it does.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     features: dict[str, Any] = {"is_demo": {"dtype": "bool", "shape": (1,), "names": None}}
@@ -127,6 +135,8 @@ def _create(row: dict[str, Any], root: Path, fps: int) -> Any:
             }
         elif name in (STATE, ACTION):
             names = [f"{name.rpartition('.')[2]} {i}" for i in range(len(value))]
+            if name == ACTION and action_names:
+                names = list(action_names)
             features[name] = {"dtype": "float32", "shape": value.shape, "names": names}
     return LeRobotDataset.create(
         f"local/{root.name}",

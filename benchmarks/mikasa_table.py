@@ -1,0 +1,235 @@
+"""Memories on MIKASA-Robo-VLA with two CPU cores: one small policy a memory for all tasks. Success,
+twin accuracy, and what of the facts each memory stored and updated, in `<output>/table.csv`.
+
+python benchmarks/mikasa_table.py --output outputs/mikasa24
+python benchmarks/mikasa_table.py --output outputs/unit --tasks RememberColor3
+--models framesamp_modul --seeds 1 --steps 20 --episodes 1 --pairs 1
+
+The same command continues an interrupted run. Rows are added when a training has been evaluated.
+"""
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mme_vla.errors import UserError
+from mme_vla.evaluation.results.baselines import missing_baselines
+from mme_vla.evaluation.store import read_folders
+from mme_vla.extras.mikasa.catalog import FAMILY_OF
+
+MOST_STEPS = 120
+"""Steps of an episode, of tasks whose own limit is longer: 93 to 122 demonstrate those three."""
+TASKS = (
+    "RememberColor3", "RememberColor5", "RememberColor9",
+    "RememberShape3", "RememberShape5", "RememberShape9",
+    "RememberShapeAndColor3x2", "RememberShapeAndColor3x3", "RememberShapeAndColor5x3",
+    "FindImposterColor3", "FindImposterColor5", "FindImposterColor9",
+    "FindImposterShape3", "FindImposterShape5", "FindImposterShape9",
+    "FindImposterShapeAndColor3x2",
+    "InterceptMedium", "InterceptGrabMedium", "RotateLenientPos", "RotateStrictPos", "TakeItBack",
+    "BunchOfColors3", "SeqOfColors3", "ChainOfColors3",
+)  # fmt: skip
+ONE_TOKEN = ("memory.budget=16", "memory.grid=1")  # sixteen frames of one token each
+MODELS: Mapping[str, Sequence[str]] = {
+    "framesamp_modul": ONE_TOKEN,
+    "tokendrop_modul": (*ONE_TOKEN, "memory.stride=2"),
+    "ttt_modul": (*ONE_TOKEN, "memory.stride=2"),
+    "events_modul": (*ONE_TOKEN, "memory.stride=2"),
+    "actions_modul": ("memory.budget=16",),
+    "present_modul": ("memory.grid=4", "memory.positions=space"),
+    "pi05": (),
+}
+"""Model → the settings of its memory, of sixteen tokens."""
+SELECTING = ("framesamp_modul", "tokendrop_modul", "events_modul", "present_modul")
+"""Models whose memory keeps frames, so that storage and update are defined."""
+TRAINING = (
+    "backbone=nano",
+    "train.batch_size=16",
+    "train.lr=1e-3",
+    "train.schedule=cosine",
+    "train.save_every=200",
+    "train.val_samples=0",
+    "train.open_loop_chunks=0",
+    "train.workers=0",
+    "logger=none",
+)
+COLUMNS = (
+    "model", "seed", "task", "memory", "successes", "episodes",
+    "twin_accuracy", "twin_pairs", "twin_chance", "storage", "update",
+)  # fmt: skip
+Run = Callable[[Sequence[str]], None]
+"""Runs a command of the library, given its words."""
+
+
+def run_command(words: Sequence[str]) -> None:
+    """Run a command in a process of its own, as its memory is then free for the next."""
+    print("mme-vla", *words, flush=True)
+    subprocess.run([sys.executable, "-m", "mme_vla", *words], check=True)
+
+
+class Table:
+    """The rows so far, each on disk as soon as it is known."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def rows(self) -> list[dict[str, str]]:
+        """What is there; a line that was cut off is not a row."""
+        if not self.path.exists():
+            return []
+        text = self.path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]
+        return list(csv.DictReader(whole.splitlines()))
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Write the rows again with one more, in one step."""
+        rows = [*self.rows(), row]
+        draft = self.path.with_suffix(".draft")
+        with draft.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        draft.replace(self.path)
+
+
+def measure(args: argparse.Namespace, run: Run = run_command) -> Table:
+    """Carry out what the output lacks: demonstrations, then a training and its measures each."""
+    for task in args.tasks:
+        if FAMILY_OF.get(task) is None:
+            raise UserError(f"--tasks: {task!r} is no task of the benchmark.")
+    for model in args.models:
+        if model not in MODELS:
+            raise UserError(f"--models: {model!r} is none of {', '.join(MODELS)}.")
+    folder: Path = args.output
+    folder.mkdir(parents=True, exist_ok=True)
+    tasks = f"tasks=[{','.join(args.tasks)}]"
+    data = folder / "demonstrations"
+    if not (data / "meta" / "info.json").is_file():
+        count = f"episodes={args.demonstrations}"
+        run(["record", "env=mikasa", tasks, count, f"output={data}"])
+
+    table = Table(folder / "table.csv")
+    for seed in range(args.seeds):
+        for model in args.models:
+            known = {(row["model"], row["seed"], row["task"]) for row in table.rows()}
+            missing = [task for task in args.tasks if (model, str(seed), task) not in known]
+            if missing:
+                for row in _rows_of(model, seed, missing, tasks, data, args, run):
+                    table.add(row)
+    return table
+
+
+def _rows_of(
+    model: str,
+    seed: int,
+    missing: Sequence[str],
+    tasks: str,
+    data: Path,
+    args: argparse.Namespace,
+    run: Run,
+) -> list[dict[str, Any]]:
+    """Train a policy, as far as it is not, and measure it: a row for each task that the table
+    lacks.
+    """
+    folder: Path = args.output
+    name = f"{model}/{seed}"
+    training = folder / "training" / name
+    if not (training / "summary.json").is_file():
+        words = [f"model={model}", *MODELS[model], *TRAINING]
+        words += [f"train.steps={args.steps}", f"seed={seed}"]
+        words += ["resume=auto", f"output={training}"]
+        run(["train", "env=mikasa", f"data.sources=[{data}]", *words])
+
+    # Both continue what an interruption left, and repeat nothing.
+    closed_loop = ["env=mikasa", f"checkpoint={training}", tasks, "execute=8"]
+    evaluated = folder / "evaluation" / name
+    run([
+        "evaluate", *closed_loop, f"episodes={args.episodes}", f"max_steps={args.most_steps}",
+        f"workers={args.workers}", f"output={evaluated}",
+    ])  # fmt: skip
+    twins = folder / "twins" / name
+    run([
+        "probe", "twins", *closed_loop, f"episodes={args.pairs}", f"output={twins}",
+    ])  # fmt: skip
+
+    # A memory that keeps frames keeps the same ones whatever it has learned.
+    writing = folder / "writing" / f"{model}.json"
+    if model in SELECTING and not writing.is_file():
+        run([
+            "analyse", "writing", "--env", "mikasa", "--checkpoint", str(training), "--memories",
+            "--tasks", ",".join(args.tasks), "--episodes", str(args.episodes),
+            "--output", str(writing),
+        ])  # fmt: skip
+
+    successes: dict[str, list[bool]] = {}
+    for record in read_folders(sorted(evaluated.glob("episodes*.jsonl"))):
+        successes.setdefault(record.task, []).append(record.success)
+    accuracies = json.loads((twins / "twins.json").read_text())["tasks"]
+    stored: dict[str, Any] = {}
+    if writing.is_file():
+        stored = next(iter(json.loads(writing.read_text()).values()))["tasks"]
+    rows = []
+    for task in missing:
+        twin: dict[str, Any] = next(iter(accuracies.get(task, {}).values()), {})
+        of_facts = stored.get(task, {})
+        rows.append(
+            {
+                "model": model,
+                "seed": seed,
+                "task": task,
+                "memory": FAMILY_OF[task].memory,
+                "successes": sum(successes[task]),
+                "episodes": len(successes[task]),
+                "twin_accuracy": twin.get("accuracy"),
+                "twin_pairs": twin.get("pairs"),
+                "twin_chance": twin.get("chance"),
+                "storage": of_facts.get("storage"),
+                "update": of_facts.get("update"),
+            }
+        )
+    return rows
+
+
+def summary(rows: Sequence[Mapping[str, str]]) -> str:
+    """Means over the rows of each model that have a value, in Markdown."""
+    lines = [
+        "| model | rows | success | twins | storage | update |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    for model in models:
+        of_model = [row for row in rows if row["model"] == model]
+        shares = [int(row["successes"]) / int(row["episodes"]) for row in of_model]
+        cells = [f"{sum(shares) / len(shares):.3f}"]
+        for column in ("twin_accuracy", "storage", "update"):
+            values = [float(row[column]) for row in of_model if row[column]]
+            cells.append(f"{sum(values) / len(values):.3f}" if values else "")
+        lines.append(f"| {model} | {len(of_model)} | {' | '.join(cells)} |")
+    return "\n".join([*lines, *missing_baselines(models)])
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Measure what is missing, and print the means."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS))
+    parser.add_argument("--models", nargs="+", default=list(MODELS))
+    parser.add_argument("--seeds", type=int, default=2, help="trainings of each model")
+    parser.add_argument("--demonstrations", type=int, default=40, help="of each task")
+    parser.add_argument("--steps", type=int, default=1000, help="updates of a training")
+    parser.add_argument("--episodes", type=int, default=10, help="test scenes of each task")
+    parser.add_argument("--pairs", type=int, default=3, help="pairs of twins of each task")
+    parser.add_argument("--most-steps", type=int, default=MOST_STEPS, help="of an episode")
+    parser.add_argument("--workers", type=int, default=2, help="processes that simulate")
+    print(summary(measure(parser.parse_args(words)).rows()))
+
+
+if __name__ == "__main__":
+    main()

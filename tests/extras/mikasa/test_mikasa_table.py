@@ -1,0 +1,137 @@
+"""benchmarks/mikasa_table.py: what a run lacks is carried out, once, and stands in the table."""
+
+import json
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from benchmarks import mikasa_table
+from benchmarks.mikasa_table import MODELS, MOST_STEPS, SELECTING, TASKS, Table, measure, summary
+from helpers.rollout_fakes import save_records
+from mme_vla.config.composition import compose
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
+
+CHOSEN = ["RememberColor3", "SeqOfColors3"]
+
+
+def arguments(output: Path, **more: object) -> Namespace:
+    values = {
+        "output": output, "tasks": CHOSEN, "models": ["framesamp_modul", "pi05"], "seeds": 2,
+        "demonstrations": 3, "steps": 5, "episodes": 2, "pairs": 1, "most_steps": 120, "workers": 1,
+    }  # fmt: skip
+    return Namespace(**{**values, **more})
+
+
+class Commands:
+    """Commands that write what the real ones do; the one of number `stop` is interrupted."""
+
+    def __init__(self, stop: int | None = None) -> None:
+        self.done: list[str] = []
+        self.stop = stop
+
+    def __call__(self, words: Sequence[str]) -> None:
+        if len(self.done) == self.stop:
+            raise KeyboardInterrupt
+        named = dict(word.split("=", 1) for word in words if "=" in word)
+        name = words[0]
+        if name == "record":
+            self._write(Path(named["output"]) / "meta" / "info.json", {})
+        if name == "train":
+            assert named["resume"] == "auto" and named["train.steps"] == "5"
+            self._write(Path(named["output"]) / "summary.json", {})
+        if name == "evaluate":
+            folder = Path(named["output"])
+            records = []
+            for task in CHOSEN:
+                for episode in range(2):
+                    outcome = "fail" if episode else "success"
+                    record = EpisodeRecord(
+                        folder.parent.name, 5, 42, task, episode, episode, "", outcome, 10
+                    )
+                    records.append(record)
+            folder.mkdir(parents=True, exist_ok=True)
+            save_records(folder / "episodes.jsonl", records)
+        if name == "probe":
+            accuracy = {"unprobed": {"accuracy": 0.5, "pairs": 1, "chance": 0.1}}
+            self._write(
+                Path(named["output"]) / "twins.json", {"tasks": {"RememberColor3": accuracy}}
+            )
+        if name == "analyse":
+            tasks = {
+                "RememberColor3": {"storage": 1.0, "update": None},
+                "SeqOfColors3": {"storage": 0.25, "update": 0.5},
+            }
+            self._write(Path(words[-1]), {"framesamp_modul": {"tasks": tasks}})
+        self.done.append(name)
+
+    def _write(self, path: Path, values: object) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(values))
+
+
+def test_every_row_is_made_once(tmp_path: Path) -> None:
+    commands = Commands()
+    rows = measure(arguments(tmp_path), commands).rows()
+    once = ["train", "evaluate", "probe"]
+    assert commands.done == ["record", *once, "analyse", *once, *once, *once]
+    assert len(rows) == 8
+    assert rows[1] == {
+        "model": "framesamp_modul", "seed": "0", "task": "SeqOfColors3", "memory": "Capacity",
+        "successes": "1", "episodes": "2", "twin_accuracy": "", "twin_pairs": "",
+        "twin_chance": "", "storage": "0.25", "update": "0.5",
+    }  # fmt: skip
+    assert [row["storage"] for row in rows if row["model"] == "pi05"] == [""] * 4
+    again = Commands()
+    assert measure(arguments(tmp_path), again).rows() == rows and again.done == []
+    text = summary(rows)
+    assert "| framesamp_modul | 4 | 0.500 | 0.500 | 0.625 | 0.500 |" in text
+    assert "train present_modul to compare" in text
+
+
+@pytest.mark.parametrize("stop", [1, 2, 4, 6])
+def test_an_interrupted_run_goes_on(tmp_path: Path, stop: int) -> None:
+    commands = Commands(stop)
+    with pytest.raises(KeyboardInterrupt):
+        measure(arguments(tmp_path), commands)
+    rest = Commands()
+    rows = measure(arguments(tmp_path), rest).rows()
+    assert len({(row["model"], row["seed"], row["task"]) for row in rows}) == len(rows) == 8
+    done = commands.done + rest.done
+    assert (done.count("record"), done.count("train"), done.count("analyse")) == (1, 4, 1)
+
+
+def test_a_row_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
+    measure(arguments(tmp_path), Commands())
+    path = tmp_path / "table.csv"
+    path.write_text(path.read_text()[:-3])
+    assert len(Table(path).rows()) == 7
+    rest = Commands()
+    assert len(measure(arguments(tmp_path), rest).rows()) == 8
+    assert rest.done == ["evaluate", "probe"], "which continue, and repeat nothing"
+
+
+def test_names_that_do_not_exist_are_refused_before_anything_runs(tmp_path: Path) -> None:
+    commands = Commands()
+    for more in ({"tasks": ["RememberColour3"]}, {"models": ["framesamp"]}):
+        with pytest.raises(UserError, match=r"'RememberColour3'|'framesamp'"):
+            measure(arguments(tmp_path, **more), commands)
+    assert commands.done == []
+
+
+def test_the_choice_of_tasks_has_every_kind_of_memory_that_runs() -> None:
+    kinds = {FAMILY_OF[task].memory for task in TASKS}
+    assert len(set(TASKS)) == 24
+    assert kinds == {family.memory for family in FAMILY_OF.values() if family.needs is None}
+    longer = [task for task in TASKS if STEPS[task] > MOST_STEPS]
+    assert longer == ["BunchOfColors3", "SeqOfColors3", "ChainOfColors3"]
+
+
+def test_each_model_is_composed_with_its_settings() -> None:
+    assert set(SELECTING) < set(MODELS)
+    for model, words in MODELS.items():
+        cfg = compose("train", [f"model={model}", *words, *mikasa_table.TRAINING])
+        assert cfg.name == model
