@@ -67,7 +67,7 @@ class Segment(NamedTuple):
     """Neighbouring blocks of one expert, run as one matrix.
 
     tokens: [b, n, d].
-    update, gate: of the sublayer before, still to be added to the tokens; None where they are.
+    update, gate: of the sublayer before, still to be added. None once the tokens have it.
     """
 
     expert: str
