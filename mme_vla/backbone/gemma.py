@@ -67,7 +67,7 @@ class Segment(NamedTuple):
     """Neighbouring blocks of one expert, run as one matrix.
 
     tokens: [b, n, d].
-    update, gate: of the sublayer before, still to be added to the tokens; None where they are.
+    update, gate: of the sublayer before, still to be added. None once the tokens have it.
     """
 
     expert: str
@@ -182,12 +182,14 @@ def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
 class Querying(NamedTuple):
     """A segment with queries, between its projection and the end of its layer.
 
+    layer: its expert's. Looked up a second time, it would need compiled code for each length.
     rows: its place in the sequence.
     x: its tokens [b, n, d].
     gate: of the attention's output.
     """
 
     expert: str
+    layer: ExpertLayer
     rows: slice
     x: Tensor
     gate: Tensor | None
@@ -265,7 +267,7 @@ class JointBlock(nn.Module):
             values.append(v)
             if q is not None:
                 queries.append(q)
-                querying.append(Querying(segment.expert, rows, x, gate))
+                querying.append(Querying(segment.expert, layer, rows, x, gate))
 
         # All queries read all keys, those of earlier passes first.
         k, v = _join(keys), _join(values)
@@ -277,14 +279,13 @@ class JointBlock(nn.Module):
         attended = attend(_join(queries), all_k, all_v, mask)
 
         # Every expert finishes its own. Only the action expert has a hook.
-        lengths = [each.x.shape[1] for each in querying]
+        lengths = [each.rows.stop - each.rows.start for each in querying]
         updated = []
         for each, piece in zip(querying, attended.split(lengths, dim=1), strict=True):
-            layer = self.experts[each.expert]  # type: ignore[assignment]
             if each.expert == self.action_expert:
-                finished = layer.finish(each.x, piece, each.gate, mlp_condition, hook)
+                finished = each.layer.finish(each.x, piece, each.gate, mlp_condition, hook)
             else:
-                finished = layer.finish(each.x, piece, each.gate, None, None)
+                finished = each.layer.finish(each.x, piece, each.gate, None, None)
             following = Segment(each.expert, *finished)
             if not defers_sum:
                 following = Segment(each.expert, following.summed())
