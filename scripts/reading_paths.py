@@ -32,7 +32,7 @@ NOT_READ = {
 """Of no concern to the mathematics: messages, checks of settings, tables of names, and marks of
 what can be made faster.
 """
-SELECTION = ["memory/tokendrop.py", "memory/history.py"]
+SELECTION = ["memory/tokendrop.py", "memory/history.py", "memory/base.py"]
 HEAD = ["backbone/flow.py"]
 SAMPLING = [
     ("policy/base.py", "act"), ("policy/base.py", "choose_actions"),

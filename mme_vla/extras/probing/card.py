@@ -217,9 +217,7 @@ def measure_card(
         else:
             notes.append(f"{label} ({interventions[label]}) was left out: it needs {why}.")
     others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
-    if MEMORYLESS in others:
-        _check_memoryless(others[MEMORYLESS])
-    else:
+    if MEMORYLESS not in others:
         notes.append(
             f"{NOT_MEMORYLESS} Train one alike (such as present_modul or pi05), evaluate it on"
             f" these scenes and name its records: references={{{MEMORYLESS}: <folder>}}."
@@ -420,18 +418,13 @@ def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
         f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same"
         " ones.",
     )
+    for record in (record for of_scene in records.values() for record in of_scene):
+        require(
+            name != MEMORYLESS or not memory_of(record.model) or is_standing(record.model),
+            f"references.{name} holds records of {record.model}, which has a memory: name those of"
+            " present_*, actions_* or pi05, or give the reference another name.",
+        )
     return records
-
-
-def _check_memoryless(scenes: Scenes) -> None:
-    """Refuse records of a policy that remembers what it saw."""
-    for records in scenes.values():
-        for record in records:
-            require(
-                not memory_of(record.model) or is_standing(record.model),
-                f"references.{MEMORYLESS} holds records of {record.model}, which has a memory: name"
-                " those of present_*, actions_* or pi05, or give the reference another name.",
-            )
 
 
 def _mean(values: Outcomes) -> float:
@@ -509,15 +502,7 @@ def tables_of(card: Card) -> list[Table]:
     arms += [
         [name, "", percent(rate), "", "", "", ""] for name, rate in (card.references or {}).items()
     ]
-    columns = (
-        "history",
-        "intervention",
-        "success",
-        "loss",
-        "95 %",
-        "lost : gained",
-        "beyond noise",
-    )
+    columns = "history", "intervention", "success", "loss", "95 %", "lost : gained", "beyond noise"
     return [
         Table("In short", ("figure", "value"), rows),
         Table("Histories in closed loop", columns, arms),

@@ -350,7 +350,7 @@ def test_a_card_tells_memory_off_from_memoryless_and_takes_a_memoryless_training
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(card_module, "run_probe", lambda *_, **__: None)
-    monkeypatch.setattr(card_module, "run_episodes", lambda *_, **__: None)
+    monkeypatch.setattr(card_module.EvaluationRun, "run", lambda run: None)
     models = {"memoryless": "present_modul", "wrong": "framesamp_modul"}
 
     def ended(folder: Path, plan: ProbePlan) -> dict[EpisodeKey, list[Any]]:
