@@ -241,7 +241,9 @@ def test_finished_run_is_recognised_from_python(at_earlier: None) -> None:
 
 def test_report_card_is_the_same(at_runs: Path) -> None:
     skip_without_extra("simulator")
-    assert_close(runs.card(), RUNS["card"])
+    card, recorded = runs.card(), RUNS["card"]
+    assert set(card["notes"]) >= set(recorded["notes"])  # a later version may add one
+    assert_close(card, {**recorded, "notes": card["notes"]})
 
 
 def test_board_ranks_the_rows_as_before(at_runs: Path) -> None:
