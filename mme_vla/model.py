@@ -23,10 +23,11 @@ From image to loss in the order of the calls, with FrameSamp and Modulator:
     ModulatorLayer.forward     integration/modulator.py: the hook, before the MLP
     masked_mean                here: the mean over steps and samples
 
-A memory works in two steps. `MemoryModule.gather_selection` chooses stored tokens, in a dataset or
-in an episode, and makes `Batch.history`. `MemoryModule.forward`, called here, encodes them. The
-stored tokens come from the vision tower and `pool_grid` (`policy/network.py`, `encode_frames`), in
-training from the vision cache.
+A memory works in two steps. `select` (memory/framesamp.py) chooses stored tokens of a history
+(memory/history.py) and `MemoryModule.forward` encodes them. In training the dataset selects, which
+makes `Batch.history`, and `memory_tokens` encodes. In an episode `MMEPolicy.encode_memories` does
+both, and `Batch.history` is None. The stored tokens come from the vision tower and `pool_grid`
+(`policy/network.py`, `encode_frames`), in training from the vision cache.
 
 Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
 """
@@ -120,8 +121,8 @@ class MMEModel(nn.Module):
 
     def prompt_condition(self, batch: Batch) -> Callable[[Tensor], Tensor]:
         """What makes stored tokens [b, n, d_vision] those that the backbone reads with the batch's
-        prompts. A selection goes through it in `memory_tokens`, and an episode's tokens as they are
-        gathered (`PromptConditionedHistory`).
+        prompts (of `pi05` the same). A selection goes through it in `memory_tokens`, and an
+        episode's tokens as they are gathered (`PromptConditionedHistory`).
         """
         return partial(
             self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask
@@ -223,9 +224,9 @@ class MMEModel(nn.Module):
                 default.
             memory: memory tokens; by default those of `batch.history`.
         """
+        batch = self.prepare_images(batch)
         if memory is None:
             memory = self.memory_tokens(batch)
-        batch = self.prepare_images(batch)
         with self.autocast():
             return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
 

@@ -164,10 +164,11 @@ class FlowHead:
         return noise["noise"]
 
     def velocity(self, predict: PredictAt, times: Tensor, noise: Mapping[str, Tensor]) -> PredictAt:
-        """The velocity [b, h, a] from the network's output.
+        """The velocity [b, h, a] as a function of a state and the number of its step; here it is
+        the network's output.
 
         Args:
-            predict: the network's output.
+            predict: the network's output, as such a function.
             times: [steps].
             noise: as `sampling_noise` makes it.
         """

@@ -56,7 +56,7 @@ class StaticKV(NamedTuple):
         return self.k[:, : self.start], self.v[:, : self.start]
 
 
-class LayerModulation(NamedTuple):
+class LayerTimeModulation(NamedTuple):
     """One layer's two time modulations, made beforehand for a sampling step."""
 
     attention: Modulation
@@ -222,7 +222,7 @@ class JointBlock(nn.Module):
         segments: Sequence[Segment],
         rope: Rotation,
         mask: AttentionMask,
-        condition: Tensor | LayerModulation | None,
+        condition: Tensor | LayerTimeModulation | None,
         hook: Callable[[Tensor], Tensor] | None = None,
         past: KeyValue | StaticKV | None = None,
     ) -> tuple[list[Segment], KeyValue]:
@@ -247,7 +247,7 @@ class JointBlock(nn.Module):
         defers_sum = segments[0].update is not None
         attention_condition: Tensor | Modulation | None
         mlp_condition: Tensor | Modulation | None
-        if isinstance(condition, LayerModulation):
+        if isinstance(condition, LayerTimeModulation):
             attention_condition, mlp_condition = condition.attention, condition.mlp
         else:
             attention_condition = mlp_condition = condition
@@ -271,7 +271,8 @@ class JointBlock(nn.Module):
 
         # All queries read all keys, those of earlier passes first.
         k, v = _join(keys), _join(values)
-        all_k, all_v = _after(past, k, v)  # a cache is filled even where nothing reads it yet
+        # A cache is filled even where nothing reads it yet.
+        all_k, all_v = _append_to_past(past, k, v)
         if not querying:
             return [], (k, v)
         if len(querying) < len(segments):
@@ -318,15 +319,15 @@ class KVCache:
 
 
 @dataclass
-class Conditioning:
+class TimeModulations:
     """Time modulations of all layers, made once for the fixed times of a sampler
-    (`JointTransformer.conditioning`).
+    (`JointTransformer.time_modulations`).
     """
 
-    layers: list[LayerModulation]
+    layers: list[LayerTimeModulation]
     final: Modulation
 
-    def at(self, index: int, rows: int = 1) -> "Conditioning":
+    def at(self, index: int, rows: int = 1) -> "TimeModulations":
         """Return the modulations of one time, which has `rows`: one for the whole batch, or one a
         sample.
         """
@@ -335,8 +336,8 @@ class Conditioning:
         def pick(m: Modulation) -> Modulation:
             return Modulation(m.scale[at_time], m.shift[at_time], m.gate[at_time])
 
-        layers = [LayerModulation(pick(m.attention), pick(m.mlp)) for m in self.layers]
-        return Conditioning(layers, pick(self.final))
+        layers = [LayerTimeModulation(pick(m.attention), pick(m.mlp)) for m in self.layers]
+        return TimeModulations(layers, pick(self.final))
 
 
 class JointTransformer(nn.Module):
@@ -392,7 +393,7 @@ class JointTransformer(nn.Module):
         self,
         blocks: Sequence[Block],
         layout: Layout,
-        condition: Tensor | Conditioning | None = None,
+        condition: Tensor | TimeModulations | None = None,
         hook: Hook | None = None,
         past: KVCache | None = None,
         keep: bool = False,
@@ -418,7 +419,7 @@ class JointTransformer(nn.Module):
             segments = [self._with_update(segment, condition) for segment in segments]
         cached: list[KeyValue | StaticKV] = []
         for i, block in enumerate(self.layers):
-            of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
+            of_layer = condition.layers[i] if isinstance(condition, TimeModulations) else condition
             past_kv = None if past is None else past.layers[i]
             segments, (k, v) = run_layer(
                 block,
@@ -434,17 +435,17 @@ class JointTransformer(nn.Module):
                 cached.append(past_kv._replace(start=past_kv.start + k.shape[1]))
             elif keep:
                 # Copies where they are views: a view would keep all queries of its layer alive.
-                k, v = _after(past_kv, k, v)
+                k, v = _append_to_past(past_kv, k, v)
                 cached.append((k.contiguous(), v.contiguous()))
         output = None
         if segments:
-            final = condition.final if isinstance(condition, Conditioning) else condition
+            final = condition.final if isinstance(condition, TimeModulations) else condition
             output = self.read_out(self.final_norm, segments[-1], final)
         if not keep:
             return output, None
         return output, KVCache(cached, layout.spans, layout.valid)
 
-    def _with_update(self, segment: Segment, condition: Conditioning | None) -> Segment:
+    def _with_update(self, segment: Segment, condition: TimeModulations | None) -> Segment:
         """A segment with an update of zeros: the first layer then shares the compiled code of the
         others.
         """
@@ -471,15 +472,15 @@ class JointTransformer(nn.Module):
             layers.append(StaticKV(keys, torch.empty_like(keys), 0))
         return KVCache(layers, [], blocks[0].mask[:, :0])
 
-    def conditioning(self, condition: Tensor) -> Conditioning:
+    def time_modulations(self, condition: Tensor) -> TimeModulations:
         """Compute every layer's modulation for conditions [m, c] at once: the weights are read
         once, not m times.
         """
-        *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
+        *of_layers, final = (norm.modulation(condition) for norm in self.time_norms())
         pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
-        return Conditioning([LayerModulation(*pair) for pair in pairs], final)
+        return TimeModulations([LayerTimeModulation(*pair) for pair in pairs], final)
 
-    def modulating(self) -> list[AdaRMSNorm]:
+    def time_norms(self) -> list[AdaRMSNorm]:
         """The norms that a condition modulates: two of every layer, and the final one."""
         norms = []
         for block in self.layers:
@@ -494,8 +495,8 @@ def read_out(norm: AdaRMSNorm, segment: Segment, condition: Tensor | Modulation)
     return output
 
 
-def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:
-    """Keys and values of a pass behind those of the past."""
+def _append_to_past(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:
+    """Keys and values of a pass behind those of the past; a `StaticKV` keeps them."""
     if past is None:
         return k, v
     if isinstance(past, StaticKV):

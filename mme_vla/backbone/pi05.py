@@ -17,7 +17,7 @@ from mme_vla.backbone.base import (
     Injection,
 )
 from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
-from mme_vla.backbone.gemma import Conditioning, JointTransformer, read_out
+from mme_vla.backbone.gemma import JointTransformer, TimeModulations, read_out
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, float32_linear
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
@@ -93,7 +93,7 @@ class Pi05Backbone(
         self.transformer = JointTransformer(config, experts)
         self._float32_linear: Callable[[nn.Linear, Tensor], Tensor] = float32_linear
         self.keep_times = False
-        self._cached: dict[int, Conditioning] = {}
+        self._cached: dict[int, TimeModulations] = {}
         self._cached_stamp: tuple[object, ...] = ()
         self.action_in = nn.Linear(config.action_dim, width)
         self.action_out = nn.Linear(width, config.action_dim)
@@ -205,9 +205,10 @@ class Pi05Backbone(
         """Integrate the flow from noise to a chunk [b, h, a], in `steps` Euler steps (10 by
         default).
 
-        All that does not depend on the flow time is computed once: keys and values of the prefix
-        and of the modulator, and every layer's time modulation. A step runs the action block alone.
-        Memory tokens are encoded before, by the model or the policy.
+        All that does not depend on x is computed once: keys and values of the prefix, and every
+        layer's modulations of all times. A step runs the action block alone. Memory tokens are
+        encoded before, by the model or the policy, and the modulator's keys and values of them come
+        with `injection`.
         """
         steps = self.head.steps if steps is None else steps
         x = self.head.start(noise, steps, batch.overlap)
@@ -225,22 +226,22 @@ class Pi05Backbone(
         step_layout = self.transformer.layout(step_blocks, injection.visibility, prefix)
         if injection.condition is None:
             rows = 1
-            conditions = self.conditions(len(times))
+            modulations = self.time_modulations(len(times))
         else:  # memory changes the condition of each sample: every time for each
             rows = len(x)
             changed = [
                 injection.condition(time.expand(rows, -1)) for time in self.time_condition(times)
             ]
-            conditions = self.transformer.conditioning(torch.cat(changed))
+            modulations = self.transformer.time_modulations(torch.cat(changed))
 
-        def predict(x_t: Tensor, index: int) -> Tensor:
+        def predict_at(x_t: Tensor, index: int) -> Tensor:
             # Its keys and values go behind the prefix, where the next step overwrites them.
             blocks = [*injection.beside, self.action_block(x_t)]
-            condition = conditions.at(index, rows)
+            condition = modulations.at(index, rows)
             hidden, _ = self.transformer(blocks, step_layout, condition, injection.hook, prefix)
             return self.project_actions(hidden)
 
-        velocity = self.head.velocity(predict, times, noise)
+        velocity = self.head.velocity(predict_at, times, noise)
         if batch.overlap is not None:
             from mme_vla.speed.rtc import rtc_guidance
 
@@ -253,7 +254,7 @@ class Pi05Backbone(
             x = self.head.step(x, velocity(x, index), len(times), scaled)
         return x
 
-    def conditions(self, steps: int) -> Conditioning:
+    def time_modulations(self, steps: int) -> TimeModulations:
         """Every layer's time modulations at the times of so many steps; kept for the next chunk
         while `keep_times`.
         """
@@ -261,13 +262,13 @@ class Pi05Backbone(
         if self.keep_times and stamp == self._cached_stamp and steps in self._cached:
             return self._cached[steps]
         times = self.head.times(steps, next(self.parameters()).device)
-        conditions = self.transformer.conditioning(self.time_condition(times))
+        modulations = self.transformer.time_modulations(self.time_condition(times))
         if self.keep_times:
             if stamp != self._cached_stamp:
                 self._cached = {}
                 self._cached_stamp = stamp
-            self._cached[steps] = conditions
-        return conditions
+            self._cached[steps] = modulations
+        return modulations
 
     # Optional capabilities
 
@@ -315,7 +316,7 @@ class Pi05Backbone(
         """Place and version of the weights that time modulations are computed from, and the
         precision.
         """
-        layers = self.transformer.modulating()
+        layers = self.transformer.time_norms()
         device = self.time_in.weight.device
         stamp: list[object] = [torch.is_autocast_enabled(device.type)]
         for module in (self.time_in, self.time_out, *layers):

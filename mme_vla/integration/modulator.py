@@ -57,7 +57,7 @@ class ModulatorLayer(nn.Module):
         padding included.
         """
         q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
-        q = rotate(q, rotation(_positions(k.shape[1], x), self.head_dim))
+        q = rotate(q, rotation(_positions(x, first=k.shape[1]), self.head_dim))
         return self.out(attend(q, k, v, mask))
 
     def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ class Modulator(Integration):
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
         # Queries have positions after all memory slots, padding included; those of memory count
         # from the same origin.
-        positions = _positions(0, tokens)
+        positions = _positions(tokens)
         if self.memory_position == "time":
             positions = tokens.shape[1] - 1 - ages_of(memory)
         rope = rotation(positions, self.head_dim)
@@ -130,5 +130,6 @@ class Modulator(Integration):
         return LayerHooks(hooks)
 
 
-def _positions(start: int, x: Tensor) -> Tensor:
-    return torch.arange(start, start + x.shape[1], device=x.device)[None]
+def _positions(x: Tensor, first: int = 0) -> Tensor:
+    """Positions [1, n] of tokens x [b, n, d], counted from `first`."""
+    return torch.arange(first, first + x.shape[1], device=x.device)[None]

@@ -42,7 +42,7 @@ def select_frames(frames: Observation, numbers: np.ndarray) -> Observation:
 
 
 class RunningEpisode:
-    """One episode between its first observation and its end.
+    """One episode from before its reset to its end.
 
     In a round `begin` or `resume` takes the frames, `read` has the policy observe a piece of them,
     `set_subgoal` and `set_actions` take what was decided, and the environment executes it. `end`

@@ -469,10 +469,10 @@ class EvaluationRun:
                 envs,
                 self.facts,
                 settings,
-                log.append,
-                options.subgoals,
-                self.folder / SUBGOALS if settings.subgoal_log else None,
-                progress,
+                record=log.append,
+                subgoals=options.subgoals,
+                subgoal_folder=self.folder / SUBGOALS if settings.subgoal_log else None,
+                progress=progress,
             )
             rollout.run(Waiting(missing, claims))
         return rollout.workload

@@ -215,6 +215,7 @@ class Rollout:
         self.workload.wall_s += time.perf_counter() - begun
 
     def _start(self, worker: int) -> None:
+        """Begin the next episode that waits, if there is one."""
         job = self._waiting.take()
         if job is None:
             return
@@ -233,6 +234,9 @@ class Rollout:
         self.envs.start(worker, job, images=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
+        """Give a worker's reply to its episode: finish it, restart it for images, or have the
+        policy observe its frames.
+        """
         running = self._running[reply.worker]
         self._scheduler.later.pop(running, None)
         self.on_reply(running, reply)
@@ -311,6 +315,7 @@ class Rollout:
         return True
 
     def _run_scheduler(self) -> None:
+        """Observe, prepare and act for the episodes whose environments have replied."""
         begun = time.perf_counter()
         for step in self._scheduler.next_steps():
             if isinstance(step, Act):
@@ -325,7 +330,7 @@ class Rollout:
         self.workload.policy_s += time.perf_counter() - begun
 
     def _proceed(self, running: RunningEpisode) -> None:
-        """Have the policy act, unless an event holds the robot first."""
+        """Queue an episode to act in the next batch, unless an event holds the robot first."""
         running.events.next(running.episode, running.steps, running.report.subtask)
         event = running.events.holding
         if event is None:
@@ -336,6 +341,7 @@ class Rollout:
         self.envs.send(running.worker, command)
 
     def _act(self, batch: list[RunningEpisode]) -> None:
+        """Choose the chunks of a batch and send the actions that are executed to their workers."""
         begun = time.perf_counter()
         if self.subgoals is not None:
             subgoals = self.subgoals.predict([running.watched for running in batch])

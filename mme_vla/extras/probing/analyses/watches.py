@@ -8,7 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, StaticKV
+from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerTimeModulation, Layout, StaticKV
 from mme_vla.backbone.layers import layout_mask
 from mme_vla.errors import UserError, require
 from mme_vla.integration.modulator import Modulator
@@ -137,7 +137,9 @@ class AttentionWatch(Watch[AttentionMass]):
         names = ("segments", "rope", "mask", "condition", "hook", "past")
         arguments = {**dict.fromkeys(names), **dict(zip(names, args, strict=False)), **kwargs}
         segments, condition = arguments["segments"], arguments["condition"]
-        of_attention = condition.attention if isinstance(condition, LayerModulation) else condition
+        of_attention = (
+            condition.attention if isinstance(condition, LayerTimeModulation) else condition
+        )
         past: KeyValue | StaticKV | None = arguments["past"]
         if isinstance(past, StaticKV):
             past = past.past()
