@@ -160,7 +160,11 @@ def test_the_commands_of_the_readme_work_from_the_wheel(
         run(["bash", "-c", line], cwd=tmp_path)
     assert list(tmp_path.rglob("*.mp4"))
     refused = subprocess.run(
-        [installed.with_name("mme-vla"), "docs"], cwd=tmp_path, capture_output=True, text=True
+        [installed.with_name("mme-vla"), "docs"],
+        cwd=tmp_path,
+        env=away_from_the_repository(),
+        capture_output=True,
+        text=True,
     )
     assert refused.returncode == 2 and "pages are in the repository" in refused.stderr
 
@@ -181,13 +185,18 @@ def source_files(folder: str, inside: str) -> set[str]:
 
 def run(command: list[str], cwd: Path) -> str:
     """Run without any way back to the repository or out to a hub, and return what was printed."""
+    done = subprocess.run(
+        command, cwd=cwd, env=away_from_the_repository(), capture_output=True, text=True
+    )
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def away_from_the_repository() -> dict[str, str]:
+    """Variables of a process that finds neither this repository nor a hub."""
     clean = {
         key: value
         for key, value in os.environ.items()
         if not key.startswith(("PYTHON", "VIRTUAL_ENV"))
     }
-    done = subprocess.run(
-        command, cwd=cwd, env={**clean, "HF_HUB_OFFLINE": "1"}, capture_output=True, text=True
-    )
-    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
-    return done.stdout
+    return {**clean, "HF_HUB_OFFLINE": "1"}
