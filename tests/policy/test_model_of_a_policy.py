@@ -97,7 +97,7 @@ def test_a_chunk_takes_six_calls_in_four_files(
         "sample_actions",
         "sample",  # of the model
         "sample",  # of the backbone, which has the Euler steps
-        "predict",
+        "predict_at",
     ]
     assert len({frame.filename for frame in calls}) == 4
 
