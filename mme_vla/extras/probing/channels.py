@@ -115,9 +115,18 @@ class OnlyFrames(History):
             full.spec, int(self._stored[earlier]) if earlier < len(frames) else self._length
         )
         self._full_history = full
+        if full.motion is not None:
+            self.motion = self._motion
+            self.state_width = full.state_width
 
     def __len__(self) -> int:
         return self._length
+
+    def _motion(self, frames: np.ndarray) -> Tensor:
+        """Of the stored frame that each frame is, or that comes before it."""
+        stored = np.maximum(np.searchsorted(self._stored, frames, side="right") - 1, 0)
+        its = [self.frames[frame] for frame in self._stored[stored].tolist()]
+        return self._full_history.motion_rows(np.array(its, np.int64))
 
     @property
     def scores(self) -> FrameScores:
