@@ -17,10 +17,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mme_vla.errors import UserError
+from mme_vla.errors import check_known
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.store import read_folders
 from mme_vla.extras.mikasa.catalog import FAMILY_OF
+from mme_vla.utils import write_atomically
 
 MOST_STEPS = 120
 """Steps of an episode, of tasks whose own limit is longer: 93 to 122 demonstrate those three."""
@@ -72,39 +73,32 @@ def run_command(words: Sequence[str]) -> None:
     subprocess.run([sys.executable, "-m", "mme_vla", *words], check=True)
 
 
-class Table:
-    """The rows so far, each on disk as soon as it is known."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def rows(self) -> list[dict[str, str]]:
-        """What is there; a line that was cut off is not a row."""
-        if not self.path.exists():
-            return []
-        text = self.path.read_text(encoding="utf-8")
-        whole = text[: text.rfind("\n") + 1]
-        return list(csv.DictReader(whole.splitlines()))
-
-    def add(self, row: Mapping[str, Any]) -> None:
-        """Write the rows again with one more, in one step."""
-        rows = [*self.rows(), row]
-        draft = self.path.with_suffix(".draft")
-        with draft.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        draft.replace(self.path)
+def read_table(path: Path) -> list[dict[str, str]]:
+    """The rows so far."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
-def measure(args: argparse.Namespace, run: Run = run_command) -> Table:
-    """Carry out what the output lacks: demonstrations, then a training and its measures each."""
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write all rows in one step, so that none is ever cut off."""
+    with write_atomically(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def measure(args: argparse.Namespace, run: Run = run_command) -> list[dict[str, str]]:
+    """Carry out what the output lacks: demonstrations, then a training and its measures each.
+
+    Returns:
+        The rows of the table.
+    """
     for task in args.tasks:
-        if FAMILY_OF.get(task) is None:
-            raise UserError(f"--tasks: {task!r} is no task of the benchmark.")
+        check_known("task in --tasks:", task, FAMILY_OF)
     for model in args.models:
-        if model not in MODELS:
-            raise UserError(f"--models: {model!r} is none of {', '.join(MODELS)}.")
+        check_known("model in --models:", model, MODELS)
     folder: Path = args.output
     folder.mkdir(parents=True, exist_ok=True)
     tasks = f"tasks=[{','.join(args.tasks)}]"
@@ -113,15 +107,16 @@ def measure(args: argparse.Namespace, run: Run = run_command) -> Table:
         count = f"episodes={args.demonstrations}"
         run(["record", "env=mikasa", tasks, count, f"output={data}"])
 
-    table = Table(folder / "table.csv")
+    table = folder / "table.csv"
     for seed in range(args.seeds):
         for model in args.models:
-            known = {(row["model"], row["seed"], row["task"]) for row in table.rows()}
+            rows = read_table(table)
+            known = {(row["model"], row["seed"], row["task"]) for row in rows}
             missing = [task for task in args.tasks if (model, str(seed), task) not in known]
             if missing:
-                for row in _rows_of(model, seed, missing, tasks, data, args, run):
-                    table.add(row)
-    return table
+                new = _rows_of(model, seed, missing, tasks, data, args, run)
+                write_table(table, [*rows, *new])
+    return read_table(table)
 
 
 def _rows_of(
@@ -228,7 +223,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--pairs", type=int, default=3, help="pairs of twins of each task")
     parser.add_argument("--most-steps", type=int, default=MOST_STEPS, help="of an episode")
     parser.add_argument("--workers", type=int, default=2, help="processes that simulate")
-    print(summary(measure(parser.parse_args(words)).rows()))
+    print(summary(measure(parser.parse_args(words))))
 
 
 if __name__ == "__main__":
