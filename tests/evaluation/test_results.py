@@ -665,12 +665,12 @@ def test_a_comparison_of_memories_names_the_baselines_that_it_lacks() -> None:
         made: list[EpisodeRecord] = []
         for model in models:
             made += records(model, {"BinFill": [1, 0, 0, 0], "MoveCube": [0, 0, 0, 0]})
-        return [note for note in aggregate(made, SMALL).notes if "in this table" in note]
+        return [note for note in aggregate(made, SMALL).notes if "This table lacks" in note]
 
     assert notes("framesamp_expert", "pi05") == [
-        "No present_* in this table, whose memory holds the current frame alone: train"
+        "This table lacks present_*, a memory of the current frame alone: train"
         " present_expert to compare.",
-        "No actions_* in this table, whose memory holds the robot's own past actions: train"
+        "This table lacks actions_*, a memory of the robot's own past actions: train"
         " actions_expert to compare.",
     ]
     assert len(notes("framesamp_modul", "present_modul")) == 1

@@ -5,7 +5,7 @@ seen the past.
 from collections.abc import Iterable
 
 STANDING = {"present": "the current frame alone", "actions": "the robot's own past actions"}
-"""Memory of a standing baseline → what it holds. Each has as many parameters as other memories."""
+"""Memory of a standing baseline → what it holds."""
 _INTEGRATIONS = ("modul", "context", "expert", "film")  # ends of the models' names
 
 
@@ -34,7 +34,7 @@ def missing_baselines(models: Iterable[str]) -> list[str]:
     for memory, content in STANDING.items():
         if memory not in present:
             sentences.append(
-                f"No {memory}_* in this table, whose memory holds {content}: train"
+                f"This table lacks {memory}_*, a memory of {content}: train"
                 f" {memory}_{integration} to compare."
             )
     return sentences

@@ -619,8 +619,8 @@ def test_a_board_names_the_standing_baselines_that_it_lacks(tmp_path: Path) -> N
     for name in ("framesamp_modul", "present_modul"):
         write_training(tmp_path, name, 0, 1)
     notes = board_page.notes(Board(read_rows([tmp_path]), samples=20))
-    assert [line for line in notes if "in this table" in line] == [
-        "No actions_* in this table, whose memory holds the robot's own past actions: train"
+    assert [line for line in notes if "This table lacks" in line] == [
+        "This table lacks actions_*, a memory of the robot's own past actions: train"
         " actions_modul to compare."
     ]
 
