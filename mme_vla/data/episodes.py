@@ -129,7 +129,11 @@ class EpisodeSource:
         self.video_cameras = tuple(videos)
         video_columns = tuple(dict.fromkeys(videos.values()))
 
-        self._check_sums(("meta/",) if images else ("meta/", "data/"))
+        # Checksums of what every opening reads anyway; tables that hold images are left to
+        # `verify`.
+        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
+        opened = ("meta/",) if images else ("meta/", "data/")
+        sums.check(*(name for name in sums.table if name.startswith(opened)))
 
         # Episodes and rows.
         self._episodes = read_episode_table(self.root, video_columns)
@@ -158,13 +162,6 @@ class EpisodeSource:
         self.scales = self._read_scales()
         action = self.robot.action
         compare_units(self.root, action.names, action.units, self.scales["action"])
-
-    def _check_sums(self, opened: tuple[str, ...]) -> None:
-        """Check what every opening reads anyway, by the beginnings of names. Tables that hold
-        images are left to `verify`.
-        """
-        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
-        sums.check(*(name for name in sums.table if name.startswith(opened)))
 
     def _read_scales(self) -> dict[str, np.ndarray]:
         """Check all vectors against their statistics; returns the greatest size of each number."""
