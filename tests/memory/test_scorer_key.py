@@ -61,6 +61,19 @@ def test_scores_under_the_key_of_another_rule_are_refused() -> None:
         check_scorer(OtherTokenDrop(64, 32))
 
 
+class NamingTokenDrop(TokenDrop):
+    """Scores by another rule, named once."""
+
+    Scorer = OtherRule
+
+
+def test_a_token_drop_stores_and_makes_the_scorer_that_its_class_names() -> None:
+    memory = NamingTokenDrop(64, 32, stride=4)
+    check_scorer(memory)
+    assert memory.make_scorer() == OtherRule(8, 4)
+    assert memory.storage.scorer == OtherRule(8, 4).key != ChangeScorer(8, 4).key
+
+
 def test_a_scorer_names_the_frames_that_it_needs() -> None:
     assert Brightness().frames_scored(4).tolist() == [0, 1, 2, 3], "all, unless it says otherwise"
     assert ChangeScorer(8, 4).frames_scored(9).tolist() == [0, 3, 7]
