@@ -48,9 +48,9 @@ def record_table(records: Sequence[EpisodeRecord]) -> pd.DataFrame:
     Columns: `run`, `task`, `episode`, `difficulty`, `outcome`, `success` (0 or 1), and `record`,
     the record itself. Figures, comparisons and curves are made of it by grouping.
     """
-    rows = [
-        (r.run, r.task, r.episode, r.difficulty, r.outcome, float(r.success), r) for r in records
-    ]
+    rows = []
+    for r in records:
+        rows.append((r.run, r.task, r.episode, r.difficulty, r.outcome, float(r.success), r))
     columns = ["run", "task", "episode", "difficulty", "outcome", "success", "record"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -107,9 +107,8 @@ class Run:
     @property
     def averaged(self) -> list[EpisodeRecord]:
         """The records that the average is over."""
-        return [
-            record for key, record in self.records.items() if key.task in self.protocol.averaged
-        ]
+        tasks = self.protocol.averaged
+        return [record for key, record in self.records.items() if key.task in tasks]
 
     @property
     def expected(self) -> int:
@@ -272,7 +271,9 @@ def aggregate(
         of_split = f" of split {split!r}" if split else ""
         raise UserError(f"There is no record{of_split}; there are: {splits or 'none'}.")
     inside = [r for r in selected if protocol.expects(r.key)]
-    included = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
+    included = inside
+    if protocol.errors == "missing":
+        included = [r for r in inside if r.outcome != "error"]
     there = Protocol.of_records(selected)
     listed = [f"{task} {_numbers_text(there.numbers_of(task))}" for task in there.tasks]
     require(
@@ -458,9 +459,10 @@ def _figure(success: pd.DataFrame, method: Method, protocol: Protocol) -> Figure
 
 def by_task(success: pd.DataFrame) -> dict[str, np.ndarray]:
     """The values of each task [episodes, columns], in the order of the tasks."""
-    return {
-        str(task): members.to_numpy() for task, members in success.groupby(level="task", sort=False)
-    }
+    values = {}
+    for task, members in success.groupby(level="task", sort=False):
+        values[str(task)] = members.to_numpy()
+    return values
 
 
 def _reported(known: PaperMethod | None, scope: Scope) -> PaperResult | None:
@@ -471,9 +473,7 @@ def _reported(known: PaperMethod | None, scope: Scope) -> PaperResult | None:
         return paper.per_task(known.name)[scope.name]
     if scope.kind == "average":
         return paper.average(known.name)
-    if scope.kind == "suite":
-        return paper.suite_mean(known.name, scope.name)
-    return paper.group_mean(known.name, scope.name)
+    return paper.mean_over(known.name, scope.tasks)
 
 
 def _check_environments(records: Sequence[EpisodeRecord]) -> None:

@@ -15,6 +15,7 @@ from mme_vla.evaluation.results.statistics import (
     Interval,
     bootstrap,
     holm,
+    mean_over_tasks,
     paired_interval,
     sign_test,
     unpaired_difference,
@@ -128,10 +129,14 @@ def compare_all(
     # Holm's values grow with every p: these are the smallest that all of them could have.
     smallest = holm([comparison.smallest_p for comparison in comparisons])
     level = 1 - protocol.confidence
-    return [
-        replace(comparison, corrected=p, significant=p < level, testable=least < level)
-        for comparison, p, least in zip(comparisons, corrected, smallest, strict=True)
-    ]
+    together = []
+    for comparison, p, least in zip(comparisons, corrected, smallest, strict=True):
+        significant = p < level
+        testable = least < level
+        together.append(
+            replace(comparison, corrected=p, significant=significant, testable=testable)
+        )
+    return together
 
 
 def pair_methods(first: Method, second: Method) -> Pairing[EpisodeKey]:
@@ -226,17 +231,17 @@ def _score(rates: pd.DataFrame) -> float:
 def compare_unpaired(first: Method, second: Method, protocol: Protocol) -> Comparison:
     """Compare the scores of two methods whose scenes are not known to be the same."""
     # Each scene is worth the mean of its trainings.
-    first_scenes = by_task(first.rates.mean(axis=1))
-    second_scenes = by_task(second.rates.mean(axis=1))
+    first_scenes = by_task(first.rates.mean(axis=1).to_frame())
+    second_scenes = by_task(second.rates.mean(axis=1).to_frame())
     tasks = [task for task in protocol.averaged if task in first_scenes and task in second_scenes]
     require(
         tasks,
         f"{first.label} and {second.label} have no task in common: there is nothing to compare.",
     )
-    first_values = [first_scenes[task][:, None] for task in tasks]
-    second_values = [second_scenes[task][:, None] for task in tasks]
-    first_rate = 100 * float(np.mean([values.mean() for values in first_values]))
-    second_rate = 100 * float(np.mean([values.mean() for values in second_values]))
+    first_values = [first_scenes[task] for task in tasks]
+    second_values = [second_scenes[task] for task in tasks]
+    first_rate = 100 * mean_over_tasks(first_values)
+    second_rate = 100 * mean_over_tasks(second_values)
     interval, p = unpaired_difference(first_values, second_values, protocol.confidence)
     all_solved = [np.ones_like(values) for values in first_values]
     none_solved = [np.zeros_like(values) for values in second_values]

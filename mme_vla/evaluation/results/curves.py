@@ -111,12 +111,17 @@ def curves_of(
         one that changes the scene keeps the episode's number and seed alone.
     """
     table = record_table(records)
-    table["run"] = [str(run) for run in table["run"]]
-    places = [place(record) for record in records]
-    placed = table[[at is not None for at in places]].copy()
-    for name in Place._fields:
-        placed[name] = [getattr(at, name) for at in places if at is not None]
-    placed["run"] = [str(run) for run in placed["run"]]
+    table["run"] = table["run"].map(str)
+    on_dial = []
+    places = []
+    for record in records:
+        at = place(record)
+        if at is not None:
+            on_dial.append(record)
+            places.append(at)
+    placed = record_table(on_dial)
+    placed[list(Place._fields)] = pd.DataFrame(places, columns=Place._fields)
+    placed["run"] = placed["run"].map(str)
     curves: Curves = {}
     for (run, task, dial, zero), members in placed.groupby(
         ["run", "task", "dial", "zero"], sort=False
@@ -184,9 +189,8 @@ def curve_figure(
         if training is not None:
             axes.axvspan(*training, color=LINE, label="training range")
         for i, (name, points) in enumerate(zip(labels, runs.values(), strict=True)):
-            amounts = [amount for amount, _, _ in points]
-            rates = np.array([rate for _, rate, _ in points])
-            low, high = np.array([interval for _, _, interval in points]).T
+            amounts, rates, intervals = map(np.array, zip(*points, strict=True))
+            low, high = intervals.T
             axes.errorbar(
                 amounts,
                 rates,

@@ -80,10 +80,11 @@ def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
     for record in records:
         if record.outcome != "error":
             counts.update(did_not_act(record))
-    return [
-        f"event={event} did not act in {counted(count, 'episode')}: its place never came."
-        for event, count in counts.items()
-    ]
+    lines = []
+    for event, count in counts.items():
+        episodes = counted(count, "episode")
+        lines.append(f"event={event} did not act in {episodes}: its place never came.")
+    return lines
 
 
 def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> Table:
@@ -157,9 +158,9 @@ def event_curves(
     """Success over the number of every event that has one; the plain run is at its
     neutral number.
     """
-    merged = [
-        replace(record, training=_recipe(record.training)) for record in merge(records, conflicts)
-    ]
+    merged = []
+    for record in merge(records, conflicts):
+        merged.append(replace(record, training=_recipe(record.training)))
     return curves_of(merged, _place, confidence, same_scenes=True)
 
 

@@ -58,22 +58,15 @@ def tier_tables(
     records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
 ) -> list[Table]:
     """For each run on RoboMME-OOD: success by task and tier, beside the published figures."""
-    merged = [
-        r
-        for r in merge(records, conflicts)
-        if base_of(r.split) == OOD and read_variant(r.split) is None
-    ]
+    of_tiers = []
+    for record in merge(records, conflicts):
+        if base_of(record.split) == OOD and read_variant(record.split) is None:
+            of_tiers.append(record)
     published = paper_table("ood")
-    columns = [
-        "task",
-        *TIERS,
-        "all",
-        "%",
-        f"{100 * confidence:g} %",
-        *(row["method"] for row in published),
-    ]
+    columns = ["task", *TIERS, "all", "%", f"{100 * confidence:g} %"]
+    columns += [row["method"] for row in published]
     tables = []
-    for run, members in record_table(merged).groupby("run", sort=False):
+    for run, members in record_table(of_tiers).groupby("run", sort=False):
         parts = {}
         for task in PAPER_ORDER:
             part = members[members["task"] == task]

@@ -51,52 +51,44 @@ def paper_table(name: str) -> list[dict[str, str]]:
 @cache
 def paper_methods() -> dict[str, PaperMethod]:
     """Every method of the paper by its name."""
-    rows = paper_table("methods")
-    return {
-        row["method"]: PaperMethod(
-            row["method"], row["label"], row["model"] or None, row["subgoal"] or None, row["family"]
-        )
-        for row in rows
-    }
+    methods = {}
+    for row in paper_table("methods"):
+        name = row["method"]
+        model = row["model"] or None
+        subgoal = row["subgoal"] or None
+        methods[name] = PaperMethod(name, row["label"], model, subgoal, row["family"])
+    return methods
 
 
 def paper_method(model: str, subgoal: str | None = None) -> PaperMethod | None:
     """The paper's method that a model of this library is, or None."""
-    return next(
-        (m for m in paper_methods().values() if (m.model, m.subgoal) == (model, subgoal)), None
-    )
+    for method in paper_methods().values():
+        if (method.model, method.subgoal) == (model, subgoal):
+            return method
+    return None
 
 
 @cache
 def per_task(method: str) -> dict[str, PaperResult]:
     """A method's results on the 16 tasks."""
-    rows = {
-        row["task"]: PaperResult(float(row["success_mean"]), float(row["success_std"]))
-        for row in paper_table("per_task")
-        if row["method"] == method
-    }
-    return {task: rows[task] for task in PAPER_ORDER}
+    results = {}
+    for row in paper_table("per_task"):
+        if row["method"] == method:
+            result = PaperResult(float(row["success_mean"]), float(row["success_std"]))
+            results[row["task"]] = result
+    return {task: results[task] for task in PAPER_ORDER}
 
 
 def average(method: str) -> PaperResult:
     """Mean over the 16 tasks, with the printed deviation where there is one."""
     printed = {row["method"]: float(row["average_std"]) for row in paper_table("suites")}
-    return PaperResult(_mean(method, PAPER_ORDER), printed.get(method))
+    return PaperResult(mean_over(method, PAPER_ORDER).mean, printed.get(method))
 
 
-def suite_mean(method: str, suite: str) -> PaperResult:
-    """Mean over the tasks of a suite."""
-    return PaperResult(_mean(method, [t.name for t in TASK_FACTS.values() if t.suite == suite]))
-
-
-def group_mean(method: str, group: str) -> PaperResult:
-    """Mean over the tasks of a functional group."""
-    return PaperResult(_mean(method, [t.name for t in TASK_FACTS.values() if t.group == group]))
-
-
-def _mean(method: str, tasks: list[str] | tuple[str, ...]) -> float:
+def mean_over(method: str, tasks: Sequence[str]) -> PaperResult:
+    """Mean over some of the tasks."""
     results = per_task(method)
-    return sum(results[task].mean for task in tasks) / len(tasks)
+    return PaperResult(sum(results[task].mean for task in tasks) / len(tasks))
 
 
 REPLAN = 16  # Frames that pass between two chunks of an episode
@@ -145,9 +137,8 @@ def write_costs(costs: list[ModelCost], path: Path) -> None:
     """Write counts as CSV."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(
-            file, [member.name for member in fields(ModelCost)], lineterminator="\n"
-        )
+        columns = [member.name for member in fields(ModelCost)]
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(asdict(cost) for cost in costs)
 
@@ -177,9 +168,8 @@ def demo_records(
         for task, result in per_task(known.name).items():
             number = PAPER_ORDER.index(task)
             levels = [_LEVELS[e % 4] for e in range(episodes)]
-            ease = np.random.default_rng([number]).normal(scale=1.5, size=episodes) + [
-                _EASE[level] for level in levels
-            ]
+            ease = np.random.default_rng([number]).normal(scale=1.5, size=episodes)
+            ease += [_EASE[level] for level in levels]
             chances = _chances(ease, result.mean / 100)
             for checkpoint in checkpoints:
                 for seed in seeds:
@@ -187,12 +177,12 @@ def demo_records(
                         [zlib.crc32(known.name.encode()), number, checkpoint, seed]
                     )
                     for episode, won in enumerate(rng.random(episodes) < chances):
-                        steps = (
-                            int(TASK_FACTS[task].steps * rng.uniform(0.7, 1.1))
-                            if won
-                            else MAX_STEPS
-                        )
-                        place = (
+                        outcome = "timeout"
+                        steps = MAX_STEPS
+                        if won:
+                            outcome = "success"
+                            steps = int(TASK_FACTS[task].steps * rng.uniform(0.7, 1.1))
+                        record = EpisodeRecord(
                             model,
                             checkpoint,
                             seed,
@@ -200,12 +190,13 @@ def demo_records(
                             episode,
                             1000 * number + episode,
                             levels[episode],
+                            outcome,
+                            steps,
+                            Seconds(0.02 * steps, 0.01 * steps, 0.03 * steps),
+                            subgoal=subgoal,
+                            made_up=True,
                         )
-                        ended = ("success" if won else "timeout", steps)
-                        time = Seconds(0.02 * steps, 0.01 * steps, 0.03 * steps)
-                        records.append(
-                            EpisodeRecord(*place, *ended, time, subgoal=subgoal, made_up=True)
-                        )
+                        records.append(record)
     return records
 
 

@@ -157,11 +157,12 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
     Returns:
         Empty text where no model of one's own has a place.
     """
-    has_place = [
-        method.model in flops and method.memory_budget is None and method.average.mean is not None
-        for method in results.methods
-    ]
-    if not any(has_place):
+    placed: list[tuple[int, Method, float]] = []  # number, and the average
+    for i, method in enumerate(results.methods):
+        mean = method.average.mean
+        if mean is not None and method.model in flops and method.memory_budget is None:
+            placed.append((i, method, mean))
+    if not placed:
         return ""
     with figure((5.6, 3.9)) as (canvas, (axes,)):
         named = set()
@@ -180,19 +181,18 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
                     lw=1.3,
                     label=label,
                 )
-        for i, method in enumerate(results.methods):
-            if has_place[i] and method.average.mean is not None:
-                axes.errorbar(
-                    flops[method.model] / 1e12,
-                    method.average.mean,
-                    method.average.std or 0,
-                    fmt="o",
-                    color=_colour(i),
-                    ecolor=INK,
-                    elinewidth=0.9,
-                    ms=7,
-                    label=method.label,
-                )
+        for i, method, mean in placed:
+            axes.errorbar(
+                flops[method.model] / 1e12,
+                mean,
+                method.average.std or 0,
+                fmt="o",
+                color=_colour(i),
+                ecolor=INK,
+                elinewidth=0.9,
+                ms=7,
+                label=method.label,
+            )
         axes.set_xlabel("TFLOPs of a sampled chunk at full size (counted)")
         axes.set_ylabel("average success (%)")
         axes.set_ylim(bottom=0)

@@ -92,11 +92,15 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals."
     if any(method.paper for method in results.methods):
         whiskers += " Lines across: the paper."
+    levels: set[str] = set()
+    has_pale = False
+    for method in results.methods:
+        levels.update(method.figures.get("difficulty", {}))
+        for figure in method.figures["task"].values():
+            has_pale = has_pale or figure.is_pale
     pale = ""
     pale_cells = ""
-    if any(
-        figure.is_pale for method in results.methods for figure in method.figures["task"].values()
-    ):
+    if has_pale:
         pale = " Pale: not all episodes of the split; n: how many."
         pale_cells = " Pale: not all episodes of the split; in brackets how many."
     difficulty = "Mean over tasks of the episodes of a difficulty."
@@ -108,9 +112,6 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
 
     # A chart is left out where it has one bar a method, or the same bars as the one of the tasks.
     n_tasks = len(protocol.tasks)
-    levels: set[str] = set()
-    for method in results.methods:
-        levels.update(method.figures.get("difficulty", {}))
     has_suites = 1 < len(protocol.suites) < n_tasks
     has_groups = 1 < len(results.methods[0].figures.get("group", {})) < n_tasks
     if has_suites:
@@ -243,8 +244,12 @@ def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
     """What a policy's configuration states of it and of its training, for the notes of a run."""
     card = config.get("card")
     card = card if isinstance(card, Mapping) else {}
-    parts = {part: _section(config.get(part)) for part in ("memory", "integration")}
-    return {**parts, "data": card.get("data"), "recipe": card.get("recipe")}
+    return {
+        "memory": _section(config.get("memory")),
+        "integration": _section(config.get("integration")),
+        "data": card.get("data"),
+        "recipe": card.get("recipe"),
+    }
 
 
 def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:
@@ -300,17 +305,14 @@ def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     recipe = facts.get("recipe")
     if not recipe:
         return [("policy", policy), ("training", UNKNOWN)]
-    settings = _settings(recipe) if isinstance(recipe, Mapping) else str(recipe)
-    return [("policy", policy), ("data", str(facts.get("data") or UNKNOWN)), ("training", settings)]
-
-
-def _settings(recipe: Mapping[str, Any]) -> str:
-    stated = (
-        f"{words} {_text(recipe[name])}"
-        for name, words in RECIPE.items()
-        if recipe.get(name) is not None
-    )
-    return ", ".join(stated) or UNKNOWN
+    training = str(recipe)
+    if isinstance(recipe, Mapping):
+        stated = []
+        for name, words in RECIPE.items():
+            if recipe.get(name) is not None:
+                stated.append(f"{words} {_text(recipe[name])}")
+        training = ", ".join(stated) or UNKNOWN
+    return [("policy", policy), ("data", str(facts.get("data") or UNKNOWN)), ("training", training)]
 
 
 def _section(value: Any) -> dict[str, Any] | None:

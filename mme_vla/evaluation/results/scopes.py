@@ -183,20 +183,16 @@ class Protocol:
     @property
     def suites(self) -> list[str]:
         """The suites that take part: RoboMME's, those of other environments, `USER_SUITE` last."""
-        return [
-            suite
-            for suite in (*SUITES, *dict.fromkeys(self.task_suites.values()), USER_SUITE)
-            if self.choose("suite", suite)
-        ]
+        others = dict.fromkeys(self.task_suites.values())
+        names = (*SUITES, *others, USER_SUITE)
+        return [suite for suite in names if self.choose("suite", suite)]
 
     def facts(self, task: str) -> Task:
         """What is known of a task; of an environment's own it is the suite."""
         facts = task_facts(task)
-        return (
-            facts
-            if task in TASK_FACTS
-            else facts._replace(suite=self.task_suites.get(task, USER_SUITE))
-        )
+        if task in TASK_FACTS:
+            return facts
+        return facts._replace(suite=self.task_suites.get(task, USER_SUITE))
 
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""
@@ -223,9 +219,9 @@ def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
     """
     names = {record.task for record in records}
     user_tasks = tuple(sorted(names - TASK_FACTS.keys()))
-    return (
-        (*PAPER_ORDER, *user_tasks) if names & TASK_FACTS.keys() or not user_tasks else user_tasks
-    )
+    if user_tasks and not names & TASK_FACTS.keys():
+        return user_tasks
+    return (*PAPER_ORDER, *user_tasks)
 
 
 GROUPING = "grouping: "
@@ -254,13 +250,12 @@ class Scope(NamedTuple):
 def scopes(protocol: Protocol) -> list[Scope]:
     """Everything figures are made of, whole tasks at a time (difficulties cut across them)."""
     result = [Scope("task", task, (task,)) for task in protocol.tasks]
-    result += [
-        Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in protocol.suites
-    ]
-    result += [Scope("group", group, tuple(protocol.choose("group", group))) for group in GROUPS]
+    for kind, names in (("suite", protocol.suites), ("group", GROUPS)):
+        for name in names:
+            result.append(Scope(kind, name, tuple(protocol.choose(kind, name))))
     for title, grouping in protocol.groupings.items():
         for group in dict.fromkeys(grouping.values()):
             members = [task for task in protocol.tasks if grouping.get(task) == group]
             result.append(Scope(GROUPING + title, group, tuple(members)))
-    result += [Scope("average", "average", protocol.averaged)]
+    result.append(Scope("average", "average", protocol.averaged))
     return [scope for scope in result if scope.tasks]

@@ -69,6 +69,11 @@ def wilson(rate: float, trials: float, confidence: float = 0.95) -> Interval:
     return Interval(float(max(0.0, centre - half)), float(min(1.0, centre + half)))
 
 
+def mean_over_tasks(tasks: Sequence[np.ndarray]) -> float:
+    """The mean over tasks, of each task's mean over its episodes and runs."""
+    return float(np.mean([outcomes.mean() for outcomes in tasks]))
+
+
 def effective_trials(tasks: Sequence[np.ndarray]) -> float:
     """How many independent episodes a mean over tasks is worth: its p(1−p) over its variance.
 
@@ -80,7 +85,7 @@ def effective_trials(tasks: Sequence[np.ndarray]) -> float:
 
     tasks: of each, successes [episodes, runs], every run on the same episodes.
     """
-    p = float(np.mean([outcomes.mean() for outcomes in tasks]))
+    p = mean_over_tasks(tasks)
     variances = []
     inverse_episodes = []
     for outcomes in tasks:
@@ -99,8 +104,7 @@ def mean_interval(tasks: Sequence[np.ndarray], confidence: float = 0.95) -> Inte
 
     tasks: as `effective_trials` takes them.
     """
-    mean = float(np.mean([outcomes.mean() for outcomes in tasks]))
-    return wilson(mean, effective_trials(tasks), confidence)
+    return wilson(mean_over_tasks(tasks), effective_trials(tasks), confidence)
 
 
 # Differences --------------------------------------------------------------------------------------
@@ -175,8 +179,7 @@ def unpaired_difference(
     variance = 0.0
     for tasks in (first, second):
         trials = effective_trials(tasks)
-        solved = trials * float(np.mean([outcomes.mean() for outcomes in tasks]))
-        rate = (solved + 1) / (trials + 2)
+        rate = (trials * mean_over_tasks(tasks) + 1) / (trials + 2)
         variance += rate * (1 - rate) / (trials + 2)
         rates.append(rate)
     difference = rates[0] - rates[1]

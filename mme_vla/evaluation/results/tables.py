@@ -206,10 +206,14 @@ def detail(method: Method, results: Results) -> Table:
 def runs_table(results: Results) -> Table:
     """Every run: how far it is, how its episodes ended, and its average."""
     columns = ["method", "checkpoint", "seed", "episodes"]
-    counts = sum((Counter(run.outcomes) for m in results.methods for run in m.runs), Counter())
+    counts: Counter[str] = Counter()
+    named = False
+    for method in results.methods:
+        for run in method.runs:
+            counts.update(run.outcomes)
+            named = named or run.key.training is not None
     outcome_names = ["success", *(name for name in OUTCOMES[1:] if counts[name])]
     columns += [*outcome_names, "average (%)"]
-    named = any(run.key.training for method in results.methods for run in method.runs)
     if named:
         columns.insert(1, "training seed")
     rows = []
