@@ -251,9 +251,8 @@ def check_overrides(
     """Compose once to see that the overrides fit, every choice of a sweep
     (`model=a,b`) included. Returns the configurations.
     """
-    columns = [_choices(override) for override in parse(overrides)]
-    columns = [column for column in columns if column]
-    n_rows = max((len(column) for column in columns), default=1)
+    columns = [column for column in map(_choices, parse(overrides)) if column]
+    n_rows = max(map(len, columns), default=1)
     composed = []
     for row in range(n_rows):
         # A column shorter than the longest stays at its first choice: every choice is seen once,

@@ -49,10 +49,11 @@ def build_site(output: Path) -> Path:
             config.plugins.on_shutdown()
         except (Abort, MkDocsException) as error:
             raise UserError(f"The site was not built: {error}") from error
-        files = [path for path in draft.rglob("*") if path.is_file()]
-        write_json(
-            draft / FILES, {path.relative_to(draft).as_posix(): file_sum(path) for path in files}
-        )
+        sums = {}
+        for path in draft.rglob("*"):
+            if path.is_file():
+                sums[path.relative_to(draft).as_posix()] = file_sum(path)
+        write_json(draft / FILES, sums)
         check_site(target)  # building takes a while
         _replace(draft, target)
     return output / "index.html"

@@ -64,7 +64,8 @@ def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> 
     source = EpisodeSource(dataset, robot=_UNMARKED)
     matches = []
     for episode in range(len(source)):
-        goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
+        goal = source.goal(episode)
+        joints = source.states(episode)[:, :ARM_JOINTS]
         distances: list[tuple[float, int]] = []  # with the start, of every one that may be it
         for one in annotated:
             if len(one.joints) == len(joints) and goal in one.goals:

@@ -26,12 +26,7 @@ from mme_vla.data.lerobot_files import SAMPLE, find_columns, read_info, resolve_
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.recording import Recording
 from mme_vla.data.robot_draft import CHECK, draft_robot, save_draft
-from mme_vla.data.sources import (
-    default_val_episodes,
-    held_out_in,
-    listed_sources,
-    source_name,
-)
+from mme_vla.data.sources import default_val_episodes, held_out_in, listed_sources, source_name
 from mme_vla.data.statistics import normalised_states
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.action_space import numbered
@@ -490,7 +485,8 @@ def show_dataset(source: EpisodeSource, console: Console) -> None:
 
 def show_episode(source: EpisodeSource, episode: int, step: int, console: Console) -> None:
     """Print an episode's phases, and what is recorded at one step."""
-    start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
+    start = int(source.exec_starts[episode])
+    length = int(source.lengths[episode])
     table = _table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
     table.add_row("task", printable(source.task(episode)))
     table.add_row("goal", printable(source.goal(episode, step)))
@@ -536,11 +532,14 @@ def draw_memory(
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
     frames = source.frames(episode, np.arange(step + 1))
-    history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
-    stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
+    start = int(source.exec_starts[episode])
+    history = OnlineHistory(memory.storage, memory.make_scorer(), start)
+    stored = history.to_encode(len(frames))
+    patches = memory.storage.grid**2
     history.append(frames, torch.zeros(len(stored), patches, 1))  # selections do not read tokens
     motion = normalised_states(source.states(episode, 0, step + 1))
-    history.motion, history.state_width = motion.__getitem__, motion.shape[1]
+    history.motion = motion.__getitem__
+    history.state_width = motion.shape[1]
     selected = memory.select(history, step)
     remembered = np.unique(selected[:, 0])
     table = _table(f"{name} at step {step}", "", "")
@@ -561,7 +560,6 @@ def draw_memory(
         f"{name} at step {step}: {len(selected)} of {memory.budget} tokens ·"
         f" {source.goal(episode, step)}"
     )
-    start = int(source.exec_starts[episode])
     memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
     return path
 

@@ -166,10 +166,11 @@ def record(
             missing, partial(record_episode, folder=folder, previews=previews), workers
         ):
             advance(1)
-    return [
-        read_json(folder / f"{job.name}.json", "what is known of a recorded episode")
-        for job in jobs
-    ]
+    recorded = []
+    for job in jobs:
+        file = folder / f"{job.name}.json"
+        recorded.append(read_json(file, "what is known of a recorded episode"))
+    return recorded
 
 
 def report_coverage(
@@ -191,9 +192,7 @@ def report_coverage(
             advance(1)
     official = [place for place in plan.places if place != plan.dataset]
     coverage = compare(goals_recorded(plan.dataset, official), zip(specs, goals, strict=True))
-    write_json(
-        file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1
-    )
+    write_json(file, {task: of_task.to_dict() for task, of_task in coverage.items()}, indent=1)
     print(f"{in_words(coverage)}\n{file}")
 
 
@@ -265,8 +264,8 @@ def main(cfg: DictConfig) -> None:
             done = record(jobs, work / "episodes", run.workers, previews)
             recording_plan.write(missing, work / "episodes", options)
             seconds = time.perf_counter() - begun  # the conversion is part of the time
-            n_steps, n_failed = 0, 0
-            n_new, n_new_steps = 0, 0
+            n_steps = n_failed = 0
+            n_new = n_new_steps = 0
             for job, recorded in zip(jobs, done, strict=True):
                 n_steps += recorded["stored"]
                 n_failed += len(recorded["failed_seeds"])

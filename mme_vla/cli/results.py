@@ -162,7 +162,8 @@ def run(args: argparse.Namespace) -> None:
             0, "Made-up records, sampled from the paper's rates: not a result of anything."
         )
     comparisons = compare_all(_pairs(results, args.compare), protocol)
-    results.notes += [note for comparison in comparisons for note in comparison.notes]
+    for comparison in comparisons:
+        results.notes += comparison.notes
     console = Console()
     for table in _tables(results, comparisons, detailed=not args.brief):
         print_table(table, console.width)
@@ -329,16 +330,12 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
     if args.csv:
         texts[args.csv] = to_csv(results)
     if args.latex:
-        texts[args.latex] = "\n".join(to_latex(table) for table in _tables(results, comparisons))
+        texts[args.latex] = "\n".join(map(to_latex, _tables(results, comparisons)))
     if args.markdown:
-        boards = [table for method in results.methods for table in leaderboard(method, results)]
-        tables = [
-            overview(results),
-            *grouping_tables(results),
-            *boards,
-            *process_tables(results),
-            *subgoal_tables(results),
-        ]
+        tables = [overview(results), *grouping_tables(results)]
+        for method in results.methods:
+            tables += leaderboard(method, results)
+        tables += [*process_tables(results), *subgoal_tables(results)]
         texts[args.markdown] = render(
             "results.md",
             tables=map(to_markdown, tables),

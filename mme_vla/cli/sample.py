@@ -31,14 +31,13 @@ LIMIT = 6_000_000
 def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
     """Write the sample and return its size in bytes."""
     folders = {"full": full, "thinned": thinned}
-    refs = [
-        EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task)
-        for kind, task, number in EPISODES
-    ]
-    for ref in refs:
+    refs = []
+    for kind, task, number in EPISODES:
+        ref = EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task)
         require(
             ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it."
         )
+        refs.append(ref)
     readme = (SAMPLE / "README.md").read_text()  # of the shipped sample, which this replaces
     convert(refs, output, OPTIONS)
     (output / "README.md").write_text(readme)

@@ -63,7 +63,8 @@ async def run(server: PolicyServer) -> None:
     """Start, wait for SIGTERM or Ctrl-C, stop; a second signal does not wait for what
     is running.
     """
-    loop, stop_requested = asyncio.get_running_loop(), asyncio.Event()
+    loop = asyncio.get_running_loop()
+    stop_requested = asyncio.Event()
     serving = asyncio.current_task()
     assert serving is not None
 

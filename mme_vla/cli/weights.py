@@ -74,9 +74,9 @@ def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: st
         console, f"{title}, unread: {about}", gaps, ("tensor", "part", "shape", "parameters")
     )
     _print_list(console, f"{title}, tied: copies", adapter.tied.items(), ("tensor", "is"))
-    derived = [
-        (constant.path, _shape(tuple(constant.make().shape))) for constant in adapter.derived
-    ]
+    derived = []
+    for constant in adapter.derived:
+        derived.append((constant.path, _shape(tuple(constant.make().shape))))
     _print_list(console, f"{title}, derived: recomputed constants", derived, ("tensor", "shape"))
 
 
@@ -185,7 +185,8 @@ def convert(
 
     With `trust_plugins` the modules that a checkpoint names are imported: its author's code.
     """
-    target, kind = Path(destination).expanduser(), dtype_of(dtype)
+    target = Path(destination).expanduser()
+    kind = dtype_of(dtype)
     require(
         dry_run or not target.exists(),
         f"{target} exists: give a new folder, nothing is ever written over.",

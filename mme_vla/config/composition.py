@@ -42,7 +42,8 @@ VERSION_BASE = "1.3"
 
 def _load_installed_plugins() -> None:
     """Load Hydra's plugins, but none of a folder `hydra_plugins` of the current directory."""
-    before, here = list(sys.path), Path.cwd().resolve()
+    before = list(sys.path)
+    here = Path.cwd().resolve()
     sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]
     try:
         Plugins.instance()
@@ -155,11 +156,10 @@ def command_trees() -> tuple[Path, ...]:
     """Folders of YAML files that the running command reads: its own, then those of
     `--config-dir`.
     """
-    sources = [
-        source
-        for source in HydraConfig.get().runtime.config_sources
-        if source.schema == "file" and source.provider != ExtensionTrees.PROVIDER
-    ]
+    sources = []
+    for source in HydraConfig.get().runtime.config_sources:
+        if source.schema == "file" and source.provider != ExtensionTrees.PROVIDER:
+            sources.append(source)
     # The command's own comes first, whatever the order in which Hydra searches.
     sources.sort(key=lambda source: source.provider != "main")
     return tuple(dict.fromkeys(Path(source.path).resolve() for source in sources))

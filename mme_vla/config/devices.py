@@ -45,7 +45,8 @@ def process_device(name: str) -> "torch.device":
     """
     import torch
 
-    device, rank = find_device(name), int(os.environ.get("LOCAL_RANK", "0"))
+    device = find_device(name)
+    rank = int(os.environ.get("LOCAL_RANK", "0"))
     if device.type != "cuda" or device.index is not None:
         return device
     return torch.device("cuda", rank % torch.cuda.device_count())

@@ -205,9 +205,15 @@ def _keys_with_word(word: str, keys: Iterable[str]) -> list[str]:
     """The dotted keys that end in this word, then those whose last part has it, as `max_batch` has
     `batch`.
     """
-    last = {key: key.rpartition(".")[2] for key in keys}
-    equal = [key for key, name in last.items() if name == word]
-    return equal + [k for k, name in last.items() if name != word and word in name.split("_")]
+    equal = []
+    containing = []
+    for key in keys:
+        last = key.rpartition(".")[2]
+        if last == word:
+            equal.append(key)
+        elif word in last.split("_"):
+            containing.append(key)
+    return equal + containing
 
 
 FORMS = (
@@ -278,7 +284,8 @@ def unknown_option(option: str, words: Sequence[str], names: Names) -> UserError
     similar = get_close_matches(typed, names.options, cutoff=0.8)
     hint = "--help lists them."
     if near:
-        hint = f"write {' or '.join(f'{key}={value or "…"}' for key in near[:3])}."
+        examples = [f"{key}={value or '…'}" for key in near[:3]]
+        hint = f"write {' or '.join(examples)}."
     elif similar:
         hint = f"--help lists them. Or did you mean the option {similar[0]!r}?"
     return UserError(
@@ -340,7 +347,8 @@ def bare_word(words: Sequence[str], number: int, names: Names) -> str:
     settings = names.settings_of(word)
     if not settings:
         near = get_close_matches(word, [*names.groups, *names.checkpoints])
-        settings = [setting for name in near for setting in names.settings_of(name)]
+        for name in near:
+            settings += names.settings_of(name)
     if not settings:
         return f"Cannot read {word!r}: settings are words of the form key=value. {FORMS}"
     text = f"Cannot read {word!r}: settings are words of the form key=value. Did you mean"

@@ -451,9 +451,12 @@ def _git(*words: str) -> list[str]:
 
 def _extras_of(policy: Policy) -> set[str]:
     """The extras that the policy's classes are from, such as `extras/nano`."""
-    kinds = [*map(type, policy.modules()), type(policy.processor)]
-    names = [kind.__module__.split(".") for kind in kinds]
-    return {"/".join(name[1:3]) for name in names if name[:2] == ["mme_vla", "extras"]}
+    extras = set()
+    for part in (*policy.modules(), policy.processor):
+        names = type(part).__module__.split(".")
+        if names[:2] == ["mme_vla", "extras"]:
+            extras.add("/".join(names[1:3]))
+    return extras
 
 
 def _version(package: str) -> str | None:
@@ -509,8 +512,12 @@ def _checkpoint(source: str | None) -> dict[str, Any]:
 
 def _loaded(folder: Path) -> list[str]:
     """Files of a checkpoint that a policy may be loaded from."""
-    names = (path.name for path in folder.iterdir() if path.suffix in _LOADED and path.is_file())
-    return sorted(name for name in names if not name.startswith(_OF_TRAINING))
+    names = []
+    for path in folder.iterdir():
+        is_of_policy = path.suffix in _LOADED and not path.name.startswith(_OF_TRAINING)
+        if is_of_policy and path.is_file():
+            names.append(path.name)
+    return sorted(names)
 
 
 def _sums(folder: Path, names: Iterable[str]) -> dict[str, str | None]:
@@ -519,5 +526,8 @@ def _sums(folder: Path, names: Iterable[str]) -> dict[str, str | None]:
     Raises:
         UserError: a name leads outside of the folder.
     """
-    paths = {name: inside(folder, name) for name in names}
-    return {name: file_sum(path) if path.is_file() else None for name, path in paths.items()}
+    sums = {}
+    for name in names:
+        path = inside(folder, name)
+        sums[name] = file_sum(path) if path.is_file() else None
+    return sums

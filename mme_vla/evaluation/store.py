@@ -246,7 +246,10 @@ def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
     folders: dict[Path, list[EpisodeRecord]] = {}
     for path in paths:
         folders.setdefault(path.resolve().parent, []).extend(read_records(path))
-    return [record for records in folders.values() for record in complete_compositions(records)]
+    completed = []
+    for records in folders.values():
+        completed += complete_compositions(records)
+    return completed
 
 
 def find_records(paths: Iterable[Path]) -> list[Path]:
@@ -310,7 +313,8 @@ class Claims:
         folder: of the run.
         records: the name of the file that this process holds and writes its records to.
         """
-        self.folder, self.records = folder, records
+        self.folder = folder
+        self.records = records
         self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}
         for path in sorted((folder / CLAIMS).glob("[!.]*.json")):
             match = _CLAIM.fullmatch(path.name)

@@ -223,9 +223,9 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
 
 
 def _holds_arrays(folder: Path) -> bool:
-    return (folder / MANIFEST).is_file() or any(
-        next(folder.glob(f"*{name}"), None) for name in ARRAY_FILES
-    )
+    if (folder / MANIFEST).is_file():
+        return True
+    return any(any(folder.glob(f"*{name}")) for name in ARRAY_FILES)
 
 
 def _is_ocdbt(params: Path | Zipped) -> bool:

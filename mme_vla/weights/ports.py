@@ -56,17 +56,17 @@ def port_adapter(policy: MMEPolicy) -> Adapter:
     Of the memory `spacetime` the layer of past states has a name too, where its tokens are as wide
     as the prefix.
     """
-    table = prefixed("backbone", names.torch_names(pi05_of(policy)))
+    backbone = pi05_of(policy)
+    table = prefixed("backbone", names.torch_names(backbone))
     memory = policy.memory
     if (
         isinstance(memory, SpaceTime)
         and memory.states is not None
-        and memory.width == pi05_of(policy).config.vlm.width
+        and memory.width == backbone.config.vlm.width
     ):
-        table |= {
-            f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")
-        }
-    unread = names.torch_unread(pi05_of(policy))
+        for part in ("weight", "bias"):
+            table[f"memory.states.{part}"] = [Piece(f"{HISTORY}.{part}")]
+    unread = names.torch_unread(backbone)
     return Adapter(table, unread, names.TIED, of_memory=rf"^{HISTORY}\.")
 
 
@@ -160,10 +160,8 @@ def _other_window(has: Mapping[str, Any], source: str) -> str:
 
 def to_lerobot(policy: MMEPolicy, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """LeRobot's state dict: all names with `model.`, embedding and language head both."""
-    return {
-        LEROBOT_PREFIX + name: tensor
-        for name, tensor in port_adapter(policy).export(tensors).items()
-    }
+    named = to_openpi(policy, tensors)
+    return {LEROBOT_PREFIX + name: tensor for name, tensor in named.items()}
 
 
 def to_openpi(policy: MMEPolicy, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -101,9 +101,8 @@ def _table(policy: MMEPolicy) -> NameTable:
 
 def released_unread(policy: MMEPolicy) -> list[Unread]:
     """Released leaves, or layers of them, that no action reads and this library does not hold."""
-    return backbone_names.released_unread(pi05_of(policy)) + memory_names.released_unread(
-        policy.memory
-    )
+    unread = backbone_names.released_unread(pi05_of(policy))
+    return unread + memory_names.released_unread(policy.memory)
 
 
 def released_derived(policy: MMEPolicy) -> list[Derived]:
@@ -117,9 +116,8 @@ def from_released(
     policy: MMEPolicy, tree: Mapping[str, Tensor], source: str = "the released tree"
 ) -> MMEPolicy:
     """Fill a policy (on meta or not) from a released tree."""
-    assign_tensors(
-        policy, released_adapter(policy).translate(tree, policy.state_dict(), source), source
-    )
+    tensors = released_adapter(policy).translate(tree, policy.state_dict(), source)
+    assign_tensors(policy, tensors, source)
     return policy
 
 

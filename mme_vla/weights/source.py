@@ -303,7 +303,9 @@ def _of_archive(file: Path) -> Source:
 
 
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
-    names = [name for file in files for name in _names(file)]
+    names = []
+    for file in files:
+        names += _names(file)
     if is_port(names):
         if "type" in Source("lerobot", folder).config:
             return Source("lerobot", folder, files)

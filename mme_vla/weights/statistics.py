@@ -1,6 +1,6 @@
 """Normalisation statistics that lie beside foreign checkpoints."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     for fmt in method_formats().values():
         if fmt.stats is not None and (stats := fmt.function("stats")(folder)) is not None:
             return stats
-    return next(_lerobot_stats(folder), None)
+    return _lerobot_stats(folder)
 
 
 def stats_files(folder: Path) -> dict[str, Path]:
@@ -58,7 +58,7 @@ def stats_files(folder: Path) -> dict[str, Path]:
     return {file.parent.relative_to(assets).as_posix(): file for file in files}
 
 
-def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
+def _lerobot_stats(folder: Path) -> NormStats | None:
     for name in _PROCESSORS:
         if not (folder / name).is_file():
             continue
@@ -77,9 +77,10 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
             )
             tensors = read_safetensors(checked_file(folder, file, "statistics"))
             if all(f"{feature}.q01" in tensors for feature in (_STATE, _ACTION)):
-                yield NormStats(
+                return NormStats(
                     state=_quantiles(tensors, _STATE), actions=_quantiles(tensors, _ACTION)
                 )
+    return None
 
 
 def _local_file(folder: Path, file: Path) -> Path:

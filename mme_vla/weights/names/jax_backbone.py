@@ -34,14 +34,18 @@ def released_unread(backbone: Pi05Backbone) -> list[Unread]:
     """What the released trees hold and no action reads: final norms, and the last layer but for its
     keys and values.
     """
-    config, experts = backbone.config, backbone.transformer.experts
+    config = backbone.config
+    heads = config.num_heads
+    h = config.head_dim
+    last = config.depth - 1
     gaps = []
-    for name, expert in experts.items():
+    for name, expert in backbone.transformer.experts.items():
         if name in SUFFIX and name != backbone.transformer.action_expert:
-            gaps.append(Unread(f"PaliGemma/llm/final_norm{SUFFIX[name]}/scale", (expert.width,)))
-            suffix, last, d, f = SUFFIX[name], config.depth - 1, expert.width, expert.mlp_dim
-            heads, h = config.num_heads, config.head_dim
+            suffix = SUFFIX[name]
+            d = expert.width
+            f = expert.mlp_dim
             gaps += [
+                Unread(f"PaliGemma/llm/final_norm{suffix}/scale", (d,)),
                 Unread(f"{LAYERS}/attn/q_einsum{suffix}/w", (heads, d, h), last),
                 Unread(f"{LAYERS}/attn/attn_vec_einsum{suffix}/w", (heads, h, d), last),
                 Unread(f"{LAYERS}/mlp{suffix}/gating_einsum", (2, d, f), last),
@@ -49,10 +53,6 @@ def released_unread(backbone: Pi05Backbone) -> list[Unread]:
                 Unread(f"{LAYERS}/pre_ffw_norm{suffix}/scale", (d,), last),
             ]
     return gaps
-
-
-def _attention_axes(config: BackboneConfig) -> dict[str, int]:
-    return {"n": config.num_heads, "h": config.head_dim}
 
 
 def _expert_layer(config: BackboneConfig, layer: ExpertLayer, suffix: str, i: int) -> NameTable:
@@ -67,10 +67,9 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, suffix: str, i: in
     table = norm("attention_norm", "pre_attention_norm")
     if layer.keys_only:
         return table | {"kv.weight": [kv]}
-    q = Piece(f"{LAYERS}/attn/q_einsum{suffix}/w", "n d h -> (n h) d", _attention_axes(config), i)
-    out = Piece(
-        f"{LAYERS}/attn/attn_vec_einsum{suffix}/w", "n h d -> d (n h)", _attention_axes(config), i
-    )
+    axes = {"n": config.num_heads, "h": config.head_dim}
+    q = Piece(f"{LAYERS}/attn/q_einsum{suffix}/w", "n d h -> (n h) d", axes, i)
+    out = Piece(f"{LAYERS}/attn/attn_vec_einsum{suffix}/w", "n h d -> d (n h)", axes, i)
     gate_up = Piece(f"{LAYERS}/mlp{suffix}/gating_einsum", "two d f -> (two f) d", {"two": 2}, i)
     down = Piece(f"{LAYERS}/mlp{suffix}/linear", "f d -> d f", {}, i)
     table |= {
@@ -83,7 +82,8 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, suffix: str, i: in
 
 
 def _vision(config: BackboneConfig) -> NameTable:
-    root, heads = "PaliGemma/img", config.vision.num_heads
+    root = "PaliGemma/img"
+    heads = config.vision.num_heads
     axes = {"n": heads, "h": config.vision.width // heads}
     table: NameTable = {
         "patch_embed.proj.weight": [Piece(f"{root}/embedding/kernel", "y x c d -> d c y x")],
@@ -95,12 +95,15 @@ def _vision(config: BackboneConfig) -> NameTable:
     for i in range(config.vision.depth):
         block = f"{root}/Transformer/encoderblock"
         attention = f"{block}/MultiHeadDotProductAttention_0"
-        qkv = [f"{attention}/{name}" for name in ("query", "key", "value")]
+        weights = []
+        biases = []
+        for name in ("query", "key", "value"):
+            path = f"{attention}/{name}"
+            weights.append(Piece(f"{path}/kernel", "d n h -> (n h) d", axes, i))
+            biases.append(Piece(f"{path}/bias", "n h -> (n h)", axes, i))
         names: NameTable = {
-            "attn.qkv.weight": [
-                Piece(f"{path}/kernel", "d n h -> (n h) d", axes, i) for path in qkv
-            ],
-            "attn.qkv.bias": [Piece(f"{path}/bias", "n h -> (n h)", axes, i) for path in qkv],
+            "attn.qkv.weight": weights,
+            "attn.qkv.bias": biases,
             "attn.proj.weight": [Piece(f"{attention}/out/kernel", "n h d -> d (n h)", axes, i)],
             "attn.proj.bias": [Piece(f"{attention}/out/bias", layer=i)],
         }

@@ -35,13 +35,14 @@ def released_derived(memory: Memory | None) -> list[Derived]:
     """Constants that released recurrent memories store: TTT's rate constant, RMT's rotary table."""
     if not isinstance(memory, RecurrentMemory):
         return []
-    layer, patches = memory.layer, memory.storage.grid**2
+    layer = memory.layer
     if isinstance(layer, TTTLayer):
         constant = layer.rate_constant
         return [Derived(f"{LAYER}/ttt_base_lr_inv", lambda: torch.tensor(constant, device="cpu"))]
     if isinstance(layer, RMTLayer):
         # Twice as many positions as are used.
-        positions, head_dim = 2 * (patches + len(layer.slots)), layer.head_dim
+        positions = 2 * (memory.storage.grid**2 + len(layer.slots))
+        head_dim = layer.head_dim
         return [Derived(f"{LAYER}/freqs_cis", lambda: rotary_table(positions, head_dim))]
     return []
 
@@ -61,14 +62,16 @@ def layer_names(layer: nn.Module, root: str = LAYER) -> NameTable:
             f"{target}.bias": [Piece(f"{root}/{source}/bias")],
         }
 
-    def kernels(names: dict[str, str]) -> NameTable:
-        return {
-            f"{target}.weight": [Piece(f"{root}/{source}/kernel", "i o -> o i")]
-            for target, source in names.items()
-        }
+    def kernel(source: str) -> list[Piece]:
+        return [Piece(f"{root}/{source}/kernel", "i o -> o i")]
 
     if isinstance(layer, TTTLayer):
-        table = kernels({"q": "wq", "k": "wk", "v": "wv", "out": "wo"})
+        table: NameTable = {
+            "q.weight": kernel("wq"),
+            "k.weight": kernel("wk"),
+            "v.weight": kernel("wv"),
+            "out.weight": kernel("wo"),
+        }
         for name in ("q_norm", "k_norm", "v_norm"):
             table |= norm(name, name)
         table |= norm("out_norm", "post_norm") | prefixed("rate", linear(f"{root}/lr_proj"))
@@ -79,18 +82,15 @@ def layer_names(layer: nn.Module, root: str = LAYER) -> NameTable:
         }
     assert isinstance(layer, RMTLayer)
     axes = {"k": layer.kv_heads, "h": layer.head_dim}
-    return (
-        kernels({"q": "q_proj", "out": "to_out"})
-        | {
-            "kv.weight": [
-                Piece(f"{root}/{name}/kernel", "i (k h) -> (k h) i", axes)
-                for name in ("k_proj", "v_proj")
-            ]
-        }
-        | {"slots": [Piece(f"{root}/memory_state")]}
-        | norm("pre_norm", "pre_norm")
-        | norm("post_norm", "post_norm")
-    )
+    k = Piece(f"{root}/k_proj/kernel", "i (k h) -> (k h) i", axes)
+    v = Piece(f"{root}/v_proj/kernel", "i (k h) -> (k h) i", axes)
+    table = {
+        "q.weight": kernel("q_proj"),
+        "out.weight": kernel("to_out"),
+        "kv.weight": [k, v],
+        "slots": [Piece(f"{root}/memory_state")],
+    }
+    return table | norm("pre_norm", "pre_norm") | norm("post_norm", "post_norm")
 
 
 def _encoder(memory: Memory, project: str) -> NameTable:

@@ -87,12 +87,12 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, root: str) -> Name
     if layer.keys_only:
         return table | {"kv.weight": kv}
     hidden = {"f": layer.mlp.down.in_features}
+    gate = Piece(f"{root}.mlp.gate_proj.weight", "f d -> f d", hidden)
+    up = Piece(f"{root}.mlp.up_proj.weight", "f d -> f d", hidden)
     table |= {
         "qkv.weight": [rows("q_proj", config.num_heads), *kv],
         "out.weight": [Piece(f"{root}.self_attn.o_proj.weight")],
-        "mlp.gate_up.weight": [
-            Piece(f"{root}.mlp.{name}_proj.weight", "f d -> f d", hidden) for name in ("gate", "up")
-        ],
+        "mlp.gate_up.weight": [gate, up],
         "mlp.down.weight": [Piece(f"{root}.mlp.down_proj.weight")],
     }
     return table | norm("mlp_norm", layer.mlp_norm, "post_attention_layernorm")
@@ -103,18 +103,18 @@ def _vision(config: VisionConfig) -> NameTable:
         "pos_embed": [Piece(f"{VISION}.embeddings.position_embedding.weight", "n d -> 1 n d")]
     }
     table |= prefixed("patch_embed.proj", _affine(f"{VISION}.embeddings.patch_embedding"))
-    table |= prefixed("norm", _affine(f"{VISION}.post_layernorm")) | prefixed(
-        "head", _affine(PROJECTOR)
-    )
+    table |= prefixed("norm", _affine(f"{VISION}.post_layernorm"))
+    table |= prefixed("head", _affine(PROJECTOR))
     for i in range(config.depth):
         root = f"{VISION}.encoder.layers.{i}"
-        qkv = [f"{root}.self_attn.{name}_proj" for name in ("q", "k", "v")]
-        names: NameTable = {
-            "attn.qkv.weight": [
-                Piece(f"{path}.weight", "e d -> e d", {"e": config.width}) for path in qkv
-            ],
-            "attn.qkv.bias": [Piece(f"{path}.bias", "e -> e", {"e": config.width}) for path in qkv],
-        } | prefixed("attn.proj", _affine(f"{root}.self_attn.out_proj"))
+        weights = []
+        biases = []
+        for name in ("q", "k", "v"):
+            path = f"{root}.self_attn.{name}_proj"
+            weights.append(Piece(f"{path}.weight", "e d -> e d", {"e": config.width}))
+            biases.append(Piece(f"{path}.bias", "e -> e", {"e": config.width}))
+        names: NameTable = {"attn.qkv.weight": weights, "attn.qkv.bias": biases}
+        names |= prefixed("attn.proj", _affine(f"{root}.self_attn.out_proj"))
         for n in (1, 2):
             names |= prefixed(f"norm{n}", _affine(f"{root}.layer_norm{n}"))
             names |= prefixed(f"mlp.fc{n}", _affine(f"{root}.mlp.fc{n}"))
