@@ -239,13 +239,13 @@ def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COM
             )
         raise CacheMissingError(f"There is no vision cache at {folder}. Build it with: {command}")
     recorded = read_json(path, "what a vision cache was made of")
-    differing = [key for key, value in expected.items() if recorded.get(key) != value]
-    if differing:
-        details = "; ".join(
-            f"{key} is {brief(recorded.get(key), 200)}, expected {expected[key]!r}"
-            for key in differing
-        )
-        raise UserError(
-            f"The vision cache {folder} is stale: {details}. Rebuild it with: {command}"
-            " rebuild=true"
-        )
+    differences = []
+    for key, value in expected.items():
+        there = recorded.get(key)
+        if there != value:
+            differences.append(f"{key} is {brief(there, 200)}, expected {value!r}")
+    require(
+        not differences,
+        f"The vision cache {folder} is stale: {'; '.join(differences)}. Rebuild it with: {command}"
+        " rebuild=true",
+    )

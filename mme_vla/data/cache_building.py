@@ -124,13 +124,14 @@ def estimate(
     batch_size: int = 32,
 ) -> Estimate:
     """Measure a few batches of the first episode and extrapolate to the dataset."""
-    n_stored = sum(
-        len(stored_frames(source, episode, memory.storage)) for episode in range(len(source))
-    )
+    n_stored = 0
+    for episode in range(len(source)):
+        n_stored += len(stored_frames(source, episode, memory.storage))
     chunk = next(_chunks(source, [0], memory, batch_size))
     encode(chunk.stored_images[:1])  # the first call pays for warming up
     started = time.perf_counter()
-    n_frames, bytes_per_frame = 0, 0
+    n_frames = 0
+    bytes_per_frame = 0
     for chunk in _chunks(source, [0], memory, batch_size):
         tokens = encode(chunk.stored_images)
         bytes_per_frame = tokens[0].numel() * np.dtype(DTYPES[dtype]).itemsize
@@ -229,7 +230,8 @@ def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
     """
     buffer = BytesIO()
     np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
-    magic, described = buffer.getvalue()[:8], buffer.getvalue()[10:].rstrip()
+    magic = buffer.getvalue()[:8]
+    described = buffer.getvalue()[10:].rstrip()
     described += b" " * (PAGE - 11 - len(described)) + b"\n"
     file.write(magic + len(described).to_bytes(2, "little") + described)
     file.write(np.ascontiguousarray(array).data)
@@ -315,11 +317,12 @@ def ahead[T](things: Iterable[T], count: int) -> Generator[T, None, None]:
     """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where
     they are used.
     """
-    iterator, pool = iter(things), ThreadPoolExecutor(1, "ahead")
+    iterator = iter(things)
+    pool = ThreadPoolExecutor(1, "ahead")
+    pending: deque[Future[Any]] = deque()
     try:
-        pending: deque[Future[Any]] = deque(
-            pool.submit(next, iterator, _END) for _ in range(count + 1)
-        )
+        for _ in range(count + 1):
+            pending.append(pool.submit(next, iterator, _END))
         while (thing := pending.popleft().result()) is not _END:
             pending.append(pool.submit(next, iterator, _END))
             yield thing

@@ -63,7 +63,8 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
     values = column.combine_chunks()
     nested = pa.types.is_list(values.type) or pa.types.is_large_list(values.type)
     if pa.types.is_fixed_size_list(values.type):
-        values, nested = values.cast(pa.list_(values.type.value_type)), True
+        values = values.cast(pa.list_(values.type.value_type))
+        nested = True
     kind = values.type.value_type if nested else values.type
     require(
         pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind),

@@ -20,7 +20,8 @@ def quiet_libraries() -> Iterator[None]:
     from lerobot.utils.utils import SuppressProgressBars
 
     root = logging.getLogger()  # LeRobot reports by it
-    level, begin = root.level, tqdm.tqdm.__init__
+    level = root.level
+    begin = tqdm.tqdm.__init__
     root.setLevel(max(level, logging.WARNING))
     tqdm.tqdm.__init__ = partialmethod(begin, disable=True)
     # x264 sums up every video that it closes. LeRobot asks for warnings only, but not until then.

@@ -69,15 +69,14 @@ class FurtherColumns:
     def __init__(
         self, source: EpisodeSource, names: ColumnNames, memory_labels: Sequence[str]
     ) -> None:
-        labels, weights = names.labels, names.weights
-        key = "The policy's labels"
-        self._source, self._memory_labels = source, tuple(memory_labels)
-        self._labels = {
-            name: label_column(source, name, key)
-            for name in dict.fromkeys((*labels, *memory_labels))
-        }
-        self._current = tuple(labels)
-        self._weights = None if weights is None else weight_column(source, weights)
+        self._source = source
+        self._current = tuple(names.labels)
+        self._memory_labels = tuple(memory_labels)
+        self._labels: dict[str, np.ndarray] = {}
+        for name in (*names.labels, *memory_labels):
+            if name not in self._labels:
+                self._labels[name] = label_column(source, name, "The policy's labels")
+        self._weights = None if names.weights is None else weight_column(source, names.weights)
 
     def items(self, episode: int, frame: int) -> dict[str, Any]:
         """What a sample at a frame has of these: `labels` and `weight`, where there are any."""

@@ -246,16 +246,19 @@ class RawEpisode:
         subgoals: dict[str, str] = {}
         for k in range(self.length):
             if not subgoals or not self._flag(k, "info/is_completed"):
-                texts = [self._text(f"timestep_{k}/info/{name}").lower() for name in SUBGOALS]
-                subgoals = dict(zip(SUBGOALS, texts, strict=True))
+                place = f"timestep_{k}/info"
+                subgoals = {name: self._text(f"{place}/{name}").lower() for name in SUBGOALS}
             yield subgoals
 
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint angles and joint targets of every step, [t, 7] each, in the file's own
         precision.
         """
-        angles = [self._numbers(k, "obs/joint_state", 7) for k in range(self.length)]
-        targets = [self._numbers(k, "action/joint_action", 7) for k in range(self.length)]
+        angles = []
+        targets = []
+        for k in range(self.length):
+            angles.append(self._numbers(k, "obs/joint_state", 7))
+            targets.append(self._numbers(k, "action/joint_action", 7))
         return np.stack(angles), np.stack(targets)
 
     def pose_actions(self, column: str) -> np.ndarray:
@@ -265,9 +268,8 @@ class RawEpisode:
         one of the video or the execution that first one; a part without any is one motion to where
         it ends.
         """
-        steps = [
-            self._numbers(k, POSE_ACTIONS[column], 7, finite=False) for k in range(self.length)
-        ]
+        name = POSE_ACTIONS[column]
+        steps = [self._numbers(k, name, 7, finite=False) for k in range(self.length)]
         return known_poses(
             np.stack(steps),
             self.exec_start,
@@ -432,10 +434,9 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
     for file, groups_of_file in groups.items():
         with _open(file) as handle:
             for group in groups_of_file:
-                poses = [
-                    name for name in poses if f"{group}/timestep_0/{POSE_ACTIONS[name]}" in handle
-                ]
-                tool_pose &= f"{group}/timestep_0/obs/{POSE_STATE}" in handle
+                step = f"{group}/timestep_0"
+                poses = [name for name in poses if f"{step}/{POSE_ACTIONS[name]}" in handle]
+                tool_pose &= f"{step}/obs/{POSE_STATE}" in handle
                 choices &= all(f"{group}/{name}" in handle for name in CHOICES)
                 partly |= f"{group}/{FRAMES}" in handle
     return {"poses": tuple(poses), "tool_pose": tool_pose, "choices": choices, "partly": partly}

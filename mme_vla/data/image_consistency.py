@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.episode_table import Description, VideoSpans
-from mme_vla.data.lerobot_files import (
-    REMEDY,
-)
+from mme_vla.data.lerobot_files import REMEDY
 from mme_vla.data.video import video_file
 from mme_vla.errors import UserError, brief, require
 from mme_vla.utils import decoding

@@ -152,11 +152,11 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     columns: dict[str, str] = {}
     missing = []
     for name, candidates in _spellings(robot).items():
-        column = next((candidate for candidate in candidates if candidate in features), None)
-        if column is None:
-            missing.append(candidates[0])
+        present = [candidate for candidate in candidates if candidate in features]
+        if present:
+            columns[name] = present[0]
         else:
-            columns[name] = column
+            missing.append(candidates[0])
     if missing:
         has_cameras = all(name in columns for name in robot.camera_names)
         raise UserError(_missing_columns(root, features, robot, missing, has_cameras))

@@ -113,11 +113,11 @@ def listed_sources(
 
 def source_name(entry: str | Mapping[str, Any]) -> str:
     """The short name of the dataset of an entry of `data.sources`, as `EpisodeSource` gives it."""
-    root, name = str(entry), None
+    root = str(entry)
     if isinstance(entry, Mapping):
-        root, name = str(entry.get("root")), entry.get("name")
-    if name:
-        return str(name)
+        root = str(entry.get("root"))
+        if entry.get("name"):
+            return str(entry["name"])
     return root if root == "sample" else Path(root).resolve().name
 
 

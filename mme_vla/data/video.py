@@ -72,7 +72,8 @@ class VideoReader:
     @staticmethod
     def _decode(container: Any, targets: np.ndarray, fps: float) -> Iterator[np.ndarray]:
         stream = container.streams.video[0]
-        tolerance, near = 0.5 / fps, _SEEK_BEYOND / fps
+        tolerance = 0.5 / fps
+        near = _SEEK_BEYOND / fps
         frames: Iterator[Any] = iter(())
         time, image = -np.inf, None
         ahead: Any = None  # the image after `image`, where it was decoded already
@@ -107,7 +108,8 @@ class VideoReader:
 
         if self._process != os.getpid():
             # open files of a parent process share their position with it
-            self._open, self._process = OrderedDict(), os.getpid()
+            self._open = OrderedDict()
+            self._process = os.getpid()
             self._may_hold = None
         if path not in self._open:
             container = av.open(str(path))

@@ -197,14 +197,18 @@ def _part(output: Path, name: str, episode: Demonstration) -> Path:
 def _h5_labels(ref: EpisodeRef) -> Labels:
     with open_episode(ref) as episode:
         joints, targets = episode.joints()
-        texts = list(episode.subgoals())
+        simple = []
+        grounded = []
+        for texts in episode.subgoals():
+            simple.append(texts["simple_subgoal"])
+            grounded.append(texts["grounded_subgoal"])
         return Labels(
             task=ref.task,
             number=ref.index,
             goal=episode.goals[0],
             exec_start=episode.exec_start,
-            simple=[text["simple_subgoal"] for text in texts],
-            grounded=[text["grounded_subgoal"] for text in texts],
+            simple=simple,
+            grounded=grounded,
             joints=joints,
             targets=targets,
         )
@@ -259,14 +263,19 @@ def _read_tasks(path: Path) -> dict[str, str]:
 
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
-    texts = [source.subgoals(episode, t) for t in range(int(source.lengths[episode]))]
+    simple = []
+    grounded = []
+    for t in range(int(source.lengths[episode])):
+        texts = source.subgoals(episode, t)
+        simple.append(texts["simple_subgoal"])
+        grounded.append(texts["grounded_subgoal"])
     return Labels(
         task=task,
         number=number,
         goal=source.goal(episode),
         exec_start=int(source.exec_starts[episode]),
-        simple=[text["simple_subgoal"] for text in texts],
-        grounded=[text["grounded_subgoal"] for text in texts],
+        simple=simple,
+        grounded=grounded,
         joints=source.states(episode)[:, :ARM_JOINTS],
         targets=source.actions(episode)[:, :ARM_JOINTS],
     )

@@ -244,9 +244,9 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         self.folder = Path(file).parent
         self._sums = Sums(self.folder, remedy="Build the training data again")
         rows = read_rows(file)
-        example = next((name for row in rows for name in row.get("images", [])), None)
-        if example is None:
-            raise UserError(f"{file} has no row with an image. Build the training data again.")
+        with_images = [row for row in rows if row.get("images")]
+        require(with_images, f"{file} has no row with an image. Build the training data again.")
+        example = with_images[0]["images"][0]
         height, width, _ = read_image(inside(self.folder, example, "picture")).shape
         n_tokens = round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE)
         n_tokens = min(max(n_tokens, 4), IMAGE_TOKENS)

@@ -49,13 +49,12 @@ def tiny_processor() -> Any:
         vocab_size=800, special_tokens=list(SPECIAL), initial_alphabet=alphabet
     )
     raw.train([str(CORPUS)], trainer)
+    marks = [token for token in SPECIAL if token not in ("<|im_end|>", "<|endoftext|>")]
     tokenizer = PreTrainedTokenizerFast(
         tokenizer_object=raw,
         eos_token="<|im_end|>",
         pad_token="<|endoftext|>",
-        additional_special_tokens=[
-            token for token in SPECIAL if token not in ("<|im_end|>", "<|endoftext|>")
-        ],
+        additional_special_tokens=marks,
     )
     vision: dict[str, Any] = {"patch_size": 16, "temporal_patch_size": 2, "merge_size": 2}
     vision |= {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
