@@ -46,14 +46,16 @@ def heading(file: Path) -> tuple[list[str], str]:
     """The comment that a file begins with: example commands, and the text after them as one
     paragraph.
     """
-    lines: list[str] = []
+    examples: list[str] = []
+    text: list[str] = []
     for line in file.read_text().splitlines():
         if not line.startswith("#"):
             break
-        if not line.startswith(_PACKAGE):
-            lines.append(line.lstrip("# "))
-    examples = [line for line in lines if line.startswith(("python -m ", "mme-vla "))]
-    text = [line for line in lines if line not in examples]
+        words = line.lstrip("# ")
+        if words.startswith(("python -m ", "mme-vla ")):
+            examples.append(words)
+        elif not line.startswith(_PACKAGE):
+            text.append(words)
     return examples, " ".join(text)
 
 

@@ -278,9 +278,11 @@ def unknown_option(option: str, words: Sequence[str], names: Names) -> UserError
     if name in names.groups:
         near = [name]
     if not near:
-        last_parts = list(dict.fromkeys(key.rpartition(".")[2] for key in names.keys))
-        for part in get_close_matches(word, last_parts):  # the nearest first
-            near += [key for key in names.keys if key.rpartition(".")[2] == part]
+        keys_of: dict[str, list[str]] = {}  # by their last part
+        for key in names.keys:
+            keys_of.setdefault(key.rpartition(".")[2], []).append(key)
+        for part in get_close_matches(word, keys_of):  # the nearest first
+            near += keys_of[part]
     similar = get_close_matches(typed, names.options, cutoff=0.8)
     hint = "--help lists them."
     if near:

@@ -19,8 +19,11 @@ def library_trees() -> tuple[Path, ...]:
     """Return the folders in the order of search: the core's, those of extras, then those of
     installed packages.
     """
-    folders = [extension.configs for extension in extensions()]
-    return (config_dir(), *(folder for folder in folders if folder is not None))
+    folders = [config_dir()]
+    for extension in extensions():
+        if extension.configs is not None:
+            folders.append(extension.configs)
+    return tuple(folders)
 
 
 def yaml_files(trees: Iterable[Path], group: str) -> dict[str, Path]:

@@ -108,11 +108,10 @@ class EpisodeSource:
         self.action_names = names_of([features[column] for column in matches.action])
         self._compare_names(robot)
         self.robot = replace(robot, action=robot.action.with_names(self.action_names))
-        self._vectors_of = {
-            "state": {name: features[name].width for name in matches.state},
-            "action": {name: features[name].width for name in matches.action},
-            "pose": {name: features[name].width for name in matches.pose},
-        }
+        vectors = {"state": matches.state, "action": matches.action, "pose": matches.pose}
+        self._vectors_of: dict[str, dict[str, int]] = {}
+        for kind, names in vectors.items():
+            self._vectors_of[kind] = {name: features[name].width for name in names}
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
         videos: dict[str, str] = {}
         images: list[str] = []

@@ -251,9 +251,10 @@ class EpisodeRecord(OfRun):
         values = {**values, "seconds": values.get("seconds") or {}}
         extra = values.get("extra")
         if isinstance(extra, Mapping):  # where earlier versions kept what is of rollouts
-            known = {name: extra[name] for name in _OF_ROLLOUTS if name in extra}
-            other = {name: value for name, value in extra.items() if name not in known}
-            values = {**values, **known, "extra": other}
+            values["extra"] = {}
+            for name, value in extra.items():
+                section = values if name in _OF_ROLLOUTS else values["extra"]
+                section[name] = value
         record = read_section(cls, values, "record")
         check_choice("record.outcome", record.outcome, OUTCOMES)
         return record

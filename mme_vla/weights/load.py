@@ -204,10 +204,14 @@ def _match_foreign(
         if adapter.of_memory is None:
             return reduced, dict(tensors), []
         known = {constant.path for constant in adapter.derived} | set(reduced.shapes(state))
-        unknown = set(tensors) - known
-        left = sorted(name for name in unknown if re.search(adapter.of_memory, name))
-        named = {name: tensor for name, tensor in tensors.items() if name not in left}
-        return reduced, named, left
+        named = {}
+        left = []
+        for name, tensor in tensors.items():
+            if name not in known and re.search(adapter.of_memory, name):
+                left.append(name)
+            else:
+                named[name] = tensor
+        return reduced, named, sorted(left)
 
     def check_names(tensors: Mapping[str, Tensor]) -> None:
         reduced, named, _ = split(tensors)

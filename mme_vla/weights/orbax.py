@@ -133,6 +133,7 @@ def read_orbax(
             }
             pending[name] = ts.open(spec, open=True, read=True)
         stores = {name: opened.result() for name, opened in pending.items()}
+        shapes = {}
         for name, store in stores.items():  # a few bytes on disk would fill the memory
             piece = math.prod(store.chunk_layout.read_chunk.shape or ())
             require(
@@ -140,8 +141,9 @@ def read_orbax(
                 f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape"
                 f" {brief(tuple(store.shape))} would lie in pieces of {piece:,} numbers.",
             )
+            shapes[name] = torch.empty(store.shape, device="meta")
         if fits is not None:
-            fits({name: torch.empty(store.shape, device="meta") for name, store in stores.items()})
+            fits(shapes)
         reads = {name: store.read() for name, store in stores.items()}
         tree = {name: _to_tensor(read.result()) for name, read in reads.items()}
     require(tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")

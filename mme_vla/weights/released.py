@@ -5,7 +5,6 @@ Leaves are named without the leading `params/` and the trailing `/value`; layers
 first axis. `orbax.py` reads and writes the files.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 from torch import Tensor
@@ -17,7 +16,6 @@ from mme_vla.errors import UserError, listed
 from mme_vla.memory.base import Memory
 from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.policy.tensor_files import assign_tensors
 from mme_vla.weights.tables import (
     Adapter,
     Derived,
@@ -110,15 +108,6 @@ def released_derived(policy: MMEPolicy) -> list[Derived]:
     written.
     """
     return memory_names.released_derived(policy.memory)
-
-
-def from_released(
-    policy: MMEPolicy, tree: Mapping[str, Tensor], source: str = "the released tree"
-) -> MMEPolicy:
-    """Fill a policy (on meta or not) from a released tree."""
-    tensors = released_adapter(policy).translate(tree, policy.state_dict(), source)
-    assign_tensors(policy, tensors, source)
-    return policy
 
 
 def to_released(policy: MMEPolicy) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from mme_vla.errors import UserError, brief
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.sections import PolicySections
-from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
+from mme_vla.policy.tensor_files import WEIGHTS, cast
 from mme_vla.processing.base import DEFAULT
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.processor import STATS_FILE, Processor
@@ -256,4 +256,4 @@ def _write_json(file: Path, content: dict[str, Any]) -> None:
 
 
 def _name(dtype: torch.dtype) -> str:
-    return next(name for name, kind in DTYPES.items() if kind == dtype)
+    return str(dtype).removeprefix("torch.")

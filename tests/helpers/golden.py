@@ -15,8 +15,9 @@ from torch import Tensor
 from mme_vla.backbone.base import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import assign_tensors
 from mme_vla.types import Batch, MemoryTokens
-from mme_vla.weights.released import from_released
+from mme_vla.weights.released import released_adapter
 
 MEMORY = {"frame_sampling": "framesamp", "token_dropping": "tokendrop", "ttt": "ttt", "rmt": "rmt"}
 INTEGRATION = {"context": "context", "modulation": "modulator", "expert": "expert"}
@@ -120,6 +121,13 @@ def recurrence(about: dict[str, Any]) -> dict[str, Any]:
     return options | {
         target: about[f"{about['type']}_config"][source] for target, source in names.items()
     }
+
+
+def from_released(policy: MMEPolicy, tree: dict[str, Tensor]) -> MMEPolicy:
+    """Fill a policy from a released tree."""
+    tensors = released_adapter(policy).translate(tree, policy.state_dict(), "the released tree")
+    assign_tensors(policy, tensors, "the released tree")
+    return policy
 
 
 def policy(tensors: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.golden import from_released
 from helpers.recurrent_memories import (
     D_VISION,
     GRID,
@@ -23,7 +24,7 @@ from mme_vla.memory.recurrent import jittered, recurrent_frames
 from mme_vla.memory.ttt import TTT
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 from mme_vla.types import HistoryTokens
-from mme_vla.weights.released import from_released, to_released
+from mme_vla.weights.released import to_released
 
 
 @pytest.fixture(params=MEMORIES)

@@ -284,7 +284,7 @@ def aggregate(
     _check_environments(included)
     by_run(included)  # refuses runs of mixed settings
     table = record_table(included)
-    table["method"] = [_method_key(run) for run in table["run"]]
+    table["method"] = table["run"].map(_method_key)
     methods = [_method(members, protocol) for _, members in table.groupby("method", sort=False)]
     methods.sort(key=lambda method: is_standing(method.model))  # last in every table
     repeats = repeated_episodes(records)

@@ -130,10 +130,12 @@ def curves_of(
         baseline = table[(table["run"] == run) & (table["task"] == task)]
         if zero not in points and not baseline.empty:
             points[zero] = baseline
-        sides = [at.groupby("episode", sort=False)["record"].apply(list) for at in points.values()]
-        common = set.intersection(*(set(side.index) for side in sides))
+        sides = []  # of each place, the records by episode
+        for at in points.values():
+            sides.append(at.groupby("episode", sort=False)["record"].apply(list).to_dict())
+        common = set.intersection(*map(set, sides))
         if same_scenes:
-            common = set(pair([side.to_dict() for side in sides]).keys)
+            common = set(pair(sides).keys)
         if not common:
             continue
         curves[run, task, dial] = []

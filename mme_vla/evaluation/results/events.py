@@ -34,11 +34,15 @@ def matched_methods(results: Results) -> list[tuple[Method, Method]]:
         names = ("model", "subgoal", "memory_budget", "composition", "recipe", "data")
         return tuple(getattr(method, name) for name in names)
 
-    baseline = {identity(method): method for method in results.methods if method.event is None}
+    baselines: dict[tuple[object, ...], Method] = {}
+    for method in results.methods:
+        if method.event is None:
+            baselines[identity(method)] = method
     matched = []
     for method in results.methods:
-        if method.event is not None and identity(method) in baseline:
-            matched.append((method, baseline[identity(method)]))
+        baseline = baselines.get(identity(method))
+        if method.event is not None and baseline is not None:
+            matched.append((method, baseline))
     return matched
 
 

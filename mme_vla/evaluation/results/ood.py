@@ -24,6 +24,7 @@ from mme_vla.evaluation.results.aggregate import record_table, repeated_episodes
 from mme_vla.evaluation.results.curves import Share, count_successes, curve_figure
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
+from mme_vla.evaluation.results.statistics import Interval
 from mme_vla.evaluation.results.tables import Table
 
 SOURCE = "development records of the authors, one run each, 1,600 steps"
@@ -287,12 +288,14 @@ def extrapolation_table(curves: Extrapolation) -> Table | None:
 
 def extrapolation_figures(curves: Extrapolation) -> dict[str, str]:
     """For each task the success of every run against the amount, the training range shaded; SVG."""
+    groups: dict[str, dict[str, list[tuple[float, float, Interval]]]] = {}
+    for _, task in sorted(curves):
+        groups[task] = {}
+    # Runs keep the order of the records, and with it their colours.
+    for (run, task), points in curves.items():
+        groups[task][run] = [(amount, p.rate, p.interval) for amount, p in points.items()]
     figures = {}
-    for task in dict.fromkeys(task for _, task in sorted(curves)):
+    for task, runs in groups.items():
         kind, _, (least, most) = AMOUNTS[task]
-        runs = {}
-        for (run, of_task), points in curves.items():
-            if of_task == task:
-                runs[run] = [(amount, p.rate, p.interval) for amount, p in points.items()]
         figures[f"{task}, {kind}"] = curve_figure(runs, kind, (least - 0.5, most + 0.5))
     return figures

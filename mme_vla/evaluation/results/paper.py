@@ -140,7 +140,7 @@ def write_costs(costs: list[ModelCost], path: Path) -> None:
         columns = [member.name for member in fields(ModelCost)]
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(asdict(cost) for cost in costs)
+        writer.writerows(map(asdict, costs))
 
 
 CHECKPOINTS = (60_000, 70_000, 79_999)

@@ -108,7 +108,8 @@ def heat_map(results: Results) -> str:
             for estimate in figures:
                 reported.append(None if estimate.paper is None else estimate.paper.mean)
             rows.append(("paper", reported))
-    values = np.array([row for _, row in rows], float)  # None is NaN
+    names, cells = zip(*rows, strict=True)
+    values = np.array(cells, float)  # None is NaN
     with figure((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
         opacity = np.ones(values.shape)
         for place in pale:
@@ -126,15 +127,15 @@ def heat_map(results: Results) -> str:
                 colour = ON_DARK
             axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=8.5)
         axes.set_xticks(range(len(tasks)), tasks, rotation=40, ha="right", rotation_mode="anchor")
-        axes.set_yticks(range(len(rows)), [name for name, _ in rows])
-        for label, (name, _) in zip(axes.get_yticklabels(), rows, strict=True):
+        axes.set_yticks(range(len(names)), names)
+        for label, name in zip(axes.get_yticklabels(), names, strict=True):
             label.set_color(FAINT if name == "paper" else INK)
         axes.grid(False)
         axes.tick_params(length=0)
         for spine in axes.spines.values():
             spine.set_visible(False)
-        for edge in range(1, len(rows)):
-            if rows[edge][0] != "paper":
+        for edge in range(1, len(names)):
+            if names[edge] != "paper":
                 axes.axhline(edge - 0.5, color=CARD, lw=3)
         # Between the suites, where the tasks are in their order
         in_order: list[str] = []

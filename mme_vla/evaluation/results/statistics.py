@@ -208,7 +208,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     factors = np.arange(len(values), 0, -1)
     corrected = np.empty_like(values)
     corrected[order] = np.maximum.accumulate(factors * values[order])
-    return [float(p) for p in corrected.clip(max=1.0)]
+    capped: list[float] = corrected.clip(max=1.0).tolist()
+    return capped
 
 
 # Bootstrap ----------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pandas as pd
 
 from mme_vla.errors import counted, printable
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run, by_training
 from mme_vla.evaluation.results.baselines import is_standing
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import GROUPING, PAPER_SEEDS, scopes
@@ -277,10 +277,12 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
 
     Cells of a run that lacks episodes of a task say how many there are, and have no average.
     """
+    checkpoints: dict[int | str, list[Run]] = {}
+    for run in method.runs:
+        checkpoints.setdefault(run.key.checkpoint, []).append(run)
+    order = {seed: i for i, seed in enumerate(PAPER_SEEDS)}
     tables = []
-    for checkpoint in dict.fromkeys(run.key.checkpoint for run in method.runs):
-        runs = [run for run in method.runs if run.key.checkpoint == checkpoint]
-        order = {seed: i for i, seed in enumerate(PAPER_SEEDS)}
+    for checkpoint, runs in checkpoints.items():
         runs.sort(key=lambda run: (order.get(run.key.model_seed, len(order)), run.key.model_seed))
         several = len(by_training(runs)) > 1
         columns = ["Task"]
@@ -457,7 +459,7 @@ def to_csv(results: Results) -> str:
     for method in results.methods:
         for kind, figures in method.figures.items():
             for name, figure in figures.items():
-                names = [_no_formula(text) for text in (method.label, kind, name)]
+                names = map(_no_formula, (method.label, kind, name))
                 low, high = figure.interval or (None, None)
                 reported = figure.paper or (None, None)
                 counts = (figure.runs, figure.complete, figure.done, figure.expected)
