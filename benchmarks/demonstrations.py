@@ -15,7 +15,7 @@ from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.robomme.recording.recorder import Recorder
 from mme_vla.envs.robomme.scene.placement import SceneError
-from mme_vla.evaluation.results.scopes import task_facts
+from mme_vla.evaluation.results.scopes import TASK_FACTS
 
 WEIGHTS = {"easy": 0.5, "medium": 0.25, "hard": 0.25}
 
@@ -52,7 +52,7 @@ def main() -> None:
         "--first", type=int, default=9_000_000, help="first seed; the benchmark's own are lower"
     )
     args = parser.parse_args()
-    paper = {name: task_facts(name).steps for name in TASK_NAMES}
+    paper = {name: TASK_FACTS[name].steps for name in TASK_NAMES}
     print("| task | easy | medium | hard | mean length | paper | ratio | seconds an episode |")
     print("|---|---|---|---|---:|---:|---:|---:|")
     for name in args.tasks:

@@ -82,19 +82,16 @@ def tier_tables(
                 row.append("–" if cell.empty else str(count_successes(cell, confidence)))
             share = count_successes(part, confidence)
             row += [str(share), f"{share.rate:.1f}", share.span]
-            row += [_published(line, task) for line in published]
+            for line in published:
+                n_episodes = int(line["episodes"])
+                if task == "all":
+                    n_episodes *= len(PAPER_ORDER)
+                row.append(f"{100 * int(line[task]) / n_episodes:.1f}")
             rows.append(row)
         last = len(rows) - 1
         title = f"{run} on RoboMME-OOD; published: {SOURCE}"
         tables.append(Table(title, columns, rows, {last}, {last}))
     return tables
-
-
-def _published(row: dict[str, str], task: str) -> str:
-    episodes = int(row["episodes"])
-    if task == "all":
-        episodes *= len(PAPER_ORDER)
-    return f"{100 * int(row[task]) / episodes:.1f}"
 
 
 def hard_table(

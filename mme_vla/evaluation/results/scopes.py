@@ -72,11 +72,6 @@ PAPER_ORDER = (
 """The tasks in the order of the paper's tables, suite by suite."""
 
 
-def task_facts(name: str) -> Task:
-    """Look a task up; what RoboMME does not have is a user's own."""
-    return TASK_FACTS.get(name) or Task(name, USER_SUITE, (), USER_SUITE, False, 0)
-
-
 @dataclass(frozen=True)
 class Protocol:
     """What a whole run consists of, and how its figures are made.
@@ -189,10 +184,10 @@ class Protocol:
 
     def facts(self, task: str) -> Task:
         """What is known of a task; of an environment's own it is the suite."""
-        facts = task_facts(task)
         if task in TASK_FACTS:
-            return facts
-        return facts._replace(suite=self.task_suites.get(task, USER_SUITE))
+            return TASK_FACTS[task]
+        suite = self.task_suites.get(task, USER_SUITE)
+        return Task(task, suite, (), USER_SUITE, False, 0)
 
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""

@@ -12,20 +12,21 @@ LAYERS = "PaliGemma/llm/layers"
 def released_names(integration: Integration) -> NameTable:
     """The table of an integration; only the modulator has tensors of its own."""
     table: NameTable = {}
-    if isinstance(integration, Modulator):
-        for i, layer in enumerate(integration.layers):
-            if isinstance(layer, ModulatorLayer):
-                table |= prefixed(f"layers.{i}", _modulator_layer(layer, i))
-    return table
-
-
-def _modulator_layer(layer: ModulatorLayer, i: int) -> NameTable:
-    heads = {"n": layer.q.out_features // layer.head_dim, "h": layer.head_dim}
-    kv_axes = {"two": 2, "k": layer.kv_heads, "h": layer.head_dim}
+    if not isinstance(integration, Modulator):
+        return table
     root = f"{LAYERS}/mem_attn"
-    return {
-        "norm.scale": [Piece(f"{root}/mem_rms_norm/scale", layer=i)],
-        "q.weight": [Piece(f"{root}/q_einsum_mem/w", "n d h -> (n h) d", heads, i)],
-        "kv.weight": [Piece(f"{root}/kv_einsum_mem/w", "two k d h -> (two k h) d", kv_axes, i)],
-        "out.weight": [Piece(f"{root}/out_einsum_mem/w", "n h d -> d (n h)", heads, i)],
-    } | prefixed("modulation", linear(f"{LAYERS}/mem_rms_norm_ffn/Dense_0", layer=i))
+    for i, layer in enumerate(integration.layers):
+        if not isinstance(layer, ModulatorLayer):
+            continue
+        heads = {"n": layer.q.out_features // layer.head_dim, "h": layer.head_dim}
+        kv_axes = {"two": 2, "k": layer.kv_heads, "h": layer.head_dim}
+        kv = Piece(f"{root}/kv_einsum_mem/w", "two k d h -> (two k h) d", kv_axes, i)
+        names: NameTable = {
+            "norm.scale": [Piece(f"{root}/mem_rms_norm/scale", layer=i)],
+            "q.weight": [Piece(f"{root}/q_einsum_mem/w", "n d h -> (n h) d", heads, i)],
+            "kv.weight": [kv],
+            "out.weight": [Piece(f"{root}/out_einsum_mem/w", "n h d -> d (n h)", heads, i)],
+        }
+        names |= prefixed("modulation", linear(f"{LAYERS}/mem_rms_norm_ffn/Dense_0", layer=i))
+        table |= prefixed(f"layers.{i}", names)
+    return table
