@@ -229,9 +229,6 @@ def main(cfg: DictConfig) -> None:
     if run.env != ROBOMME:
         record_environment(run)
         return
-    require(
-        run.env == "mme_vla", f"env={run.env} has no demonstrator here: record with env=mme_vla."
-    )
     if not run.lerobot and run.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
     rate = run.fps or _FPS
