@@ -133,9 +133,8 @@ class Reflection:
     def __call__(self, batch: Batch, rows: Sequence[int]) -> Batch:
         """The batch of these decisions with its objects elsewhere, as chosen by the rows."""
         generator = generator_for("reflection", *map(int, rows))
-        changes = (torch.rand(3, len(rows), generator=generator) < self.p) & ~self.fixed[
-            torch.as_tensor(list(rows))
-        ]
+        changes = torch.rand(3, len(rows), generator=generator) < self.p
+        changes = changes & ~self.fixed[torch.as_tensor(list(rows))]
         signs, exchange = torch.where(changes[:2], -1.0, 1.0).T, changes[2]
         assert batch.view_tokens is not None and batch.actions is not None
         low, high = self.bounds
@@ -422,9 +421,9 @@ def _items(
 
 
 def _decisions(policy: MMEPolicy, demonstration: Demonstration) -> list[int]:
-    return [
-        int(frame) for frame in demonstration.motions.decisions[:: policy.embodiment.action.execute]
-    ]
+    every = policy.embodiment.action.execute
+    decisions: list[int] = demonstration.motions.decisions[::every].tolist()
+    return decisions
 
 
 def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens) -> History | None:
