@@ -4,6 +4,7 @@ recovers from a wrong one.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -207,7 +208,8 @@ def measure_card(
     channel = channel_of(policy)
     in_simulation = options.base is make_env and settings.env == "mme_vla"
     arms = {label: read_arm(word) for label, word in interventions.items()}
-    possible, notes = [], []
+    possible = []
+    notes = []
     for label, arm in arms.items():
         why = lacking(
             arm, policy, channel, len(plan.lend), boundaries=in_simulation, n_goals=plan.n_goals
@@ -247,9 +249,9 @@ def measure_card(
     # The scenes that are the same in every run.
     unprobed = ended_scenes(folder / ONLINE / slug(UNPROBED.name), plan)
     equal = ended_scenes(folder / AGAIN, plan)
-    probed = {
-        label: ended_scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible
-    }
+    probed = {}
+    for label in possible:
+        probed[label] = ended_scenes(folder / ONLINE / slug(arms[label].name), plan)
     same = pair([unprobed, equal, *probed.values()])
     notes += same.gaps("The arms")
     require(same.keys or not same.left_out, " ".join(same.gaps("The arms")))
@@ -259,7 +261,8 @@ def measure_card(
         notes += beside.notes(f"references.{name}")
         if beside.keys:
             success_of_references[name] = _mean(_success(records, beside.keys))
-    matched, repeated = (_success(side, same.keys) for side in (unprobed, equal))
+    matched = _success(unprobed, same.keys)
+    repeated = _success(equal, same.keys)
     outcomes = {label: _success(side, same.keys) for label, side in probed.items()}
     suites = environment(settings.env).suites_of(job.task for job in plan.jobs)
     return replace(
@@ -396,7 +399,10 @@ Scenes = dict[EpisodeKey, list[EpisodeRecord]]
 
 def _success(records: Scenes, keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, float]:
     """Success of these scenes."""
-    return outcomes_of(record for key in keys for record in records[key])
+    selected: list[EpisodeRecord] = []
+    for key in keys:
+        selected += records[key]
+    return outcomes_of(selected)
 
 
 def ended_scenes(folder: Path, plan: ProbePlan) -> Scenes:
@@ -418,7 +424,7 @@ def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
         f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same"
         " ones.",
     )
-    for record in (record for of_scene in records.values() for record in of_scene):
+    for record in chain.from_iterable(records.values()):
         require(
             name != MEMORYLESS or not memory_of(record.model) or is_standing(record.model),
             f"references.{name} holds records of {record.model}, which has a memory: name those of"
@@ -447,7 +453,9 @@ def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
     if not columns:
         return np.zeros((0, _SAMPLES))
     tables = [_by_task(column) for column in columns]
-    tasks = {task: [table[task][:, None] for table in tables] for task in tables[0]}
+    tasks = {}
+    for task in tables[0]:
+        tasks[task] = [table[task][:, None] for table in tables]
     return resampled_means(tasks, _SAMPLES, seed=0)
 
 
@@ -478,9 +486,8 @@ def tables_of(card: Card) -> list[Table]:
     """The card as tables."""
     after = card.recovery
     rows = [["memory-or-clock score", _score(card.memory_or_clock)]]
-    rows += [
-        [f"memory-or-clock score, {suite}", _score(score)] for suite, score in card.suites.items()
-    ]
+    for suite, score in card.suites.items():
+        rows.append([f"memory-or-clock score, {suite}", _score(score)])
     rows.append(["noise: scenes that end otherwise in an equal run", percent(card.noise)])
     if after is not None:
         median = "no" if after.median is None else f"{after.median:g} decisions"
@@ -499,9 +506,8 @@ def tables_of(card: Card) -> list[Table]:
             f"[{100 * loss.low:.0f}, {100 * loss.high:.0f}]", f"{loss.lost} : {loss.gained}",
             "yes" if loss.beyond_noise else "no",
         ])  # fmt: skip
-    arms += [
-        [name, "", percent(rate), "", "", "", ""] for name, rate in (card.references or {}).items()
-    ]
+    for name, rate in (card.references or {}).items():
+        arms.append([name, "", percent(rate), "", "", "", ""])
     columns = "history", "intervention", "success", "loss", "95 %", "lost : gained", "beyond noise"
     return [
         Table("In short", ("figure", "value"), rows),

@@ -57,11 +57,14 @@ class Findings:
     @classmethod
     def of(cls, lines: Iterable[Line]) -> "Findings":
         """Sort the lines."""
-        every = list(lines)
-        return cls(
-            [x for x in every if isinstance(x, MomentLine)],
-            [x for x in every if isinstance(x, EntryLine)],
-        )
+        moments: list[MomentLine] = []
+        entries: list[EntryLine] = []
+        for line in lines:
+            if isinstance(line, MomentLine):
+                moments.append(line)
+            else:
+                entries.append(line)
+        return cls(moments, entries)
 
     def arms(self) -> dict[str, Effect]:
         """The effect of every arm, in the order in which they came."""

@@ -109,20 +109,20 @@ class _Moments:
         self._by_feed: dict[Feed, list[ProbedPolicy]] = defaultdict(list)
         for arm in [UNPROBED, *arms]:
             self._by_feed[arm.feed].append(ProbedPolicy(policy, arm, sessions, donors).eval())
-        self._draws = self._shared_noise()
+        # Of each step, the noise that all arms share
+        generator = torch.Generator().manual_seed(self._seed)
+        self._draws: dict[int, list[Noise]] = {step: [] for step in self._steps}
+        for noise_of_step in self._draws.values():
+            for _ in range(settings.draws):
+                noise_of_step.append(policy.sampling_noise(generator))
         self._baseline: dict[int, Tensor] = {}  # Unprobed chunks [draws, h, w] of each step
 
     def lines(self) -> list[Line]:
         """All lines."""
-        return [line for probed in self._by_feed.values() for line in self._watch(probed)]
-
-    def _shared_noise(self) -> dict[int, list[Noise]]:
-        generator = torch.Generator().manual_seed(self._seed)
-        draws: dict[int, list[Noise]] = {step: [] for step in self._steps}
-        for noise_of_step in draws.values():
-            for _ in range(self._settings.draws):
-                noise_of_step.append(self._policy.sampling_noise(generator))
-        return draws
+        result: list[Line] = []
+        for probed in self._by_feed.values():
+            result += self._watch(probed)
+        return result
 
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
         """Run the episode once for arms with the same feed."""
