@@ -198,8 +198,8 @@ def targets(board: Board) -> Table:
     words = {None: "", True: "yes", False: "no"}
     rows = []
     for target in board.targets():
-        measured = [target.measured, target.interval, target.test]
-        rows.append([target.name, *measured, words[target.reached]])
+        reached = words[target.reached]
+        rows.append([target.name, target.measured, target.interval, target.test, reached])
     return Table("Targets", ["target", "measured", "95 %", "better : worse", "reached"], rows)
 
 
