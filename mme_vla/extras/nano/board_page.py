@@ -162,12 +162,13 @@ def published(board: Board) -> Table:
     scopes: dict[str, Sequence[str]] = {"all": board.protocol.tasks}
     for suite in board.protocol.suites:
         scopes[suite] = board.protocol.choose("suite", suite)
-    rows = [[row.name] for row, _ in board.published]
+    pairs = board.published
+    rows = [[row.name] for row, _ in pairs]
     columns = ["row"]
     for name, scope in scopes.items():
         columns += [f"{name}, here", f"{name}, paper"]
-        measured = np.array([board.success(row, scope) for row, _ in board.published])
-        reported = np.array([published_success(method, scope) for _, method in board.published])
+        measured = np.array([board.success(row, scope) for row, _ in pairs])
+        reported = np.array([published_success(method, scope) for _, method in pairs])
         for i, cells in enumerate(rows):
             for values in (measured, reported):
                 place = 1 + (values > values[i]).sum()
@@ -299,15 +300,22 @@ def budget_figure(board: Board) -> str:
     every_budget: set[int] = set()
     with figure((5.6, 3.6)) as (canvas, (axes,)):
         for number, (model, rows) in enumerate(several.items()):
-            rows.sort(key=lambda row: row.facts.budget or 0)
-            budgets = [row.facts.budget or 0 for row in rows]
+            budgets = []
+            means = []
+            below = []  # from a mean to the lower end of its interval
+            above = []
+            for row in sorted(rows, key=lambda row: row.facts.budget or 0):
+                mean = board.success(row)
+                low, high = board.interval(row)
+                budgets.append(row.facts.budget or 0)
+                means.append(mean)
+                below.append(max(mean - low, 0))
+                above.append(max(high - mean, 0))
             every_budget.update(budgets)
-            means = np.array([board.success(row) for row in rows])
-            low, high = np.array([board.interval(row) for row in rows]).T
             axes.errorbar(
                 budgets,
                 means,
-                np.maximum([means - low, high - means], 0),
+                [below, above],
                 fmt="-o",
                 ms=5,
                 capsize=3,

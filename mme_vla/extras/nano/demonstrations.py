@@ -213,7 +213,10 @@ def frames_required(
         read.update(choice.read(frames, exec_start))
     if not choices:
         decided.update(decisions.tolist())
-    return {camera: decided | read if camera == "front" else decided for camera in cameras}
+    required = dict.fromkeys(cameras, decided)
+    if "front" in required:
+        required["front"] = decided | read
+    return required
 
 
 def demonstrated(scene: Scene) -> bool:

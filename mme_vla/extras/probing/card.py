@@ -208,14 +208,14 @@ def measure_card(
     channel = channel_of(policy)
     in_simulation = options.base is make_env and settings.env == "mme_vla"
     arms = {label: read_arm(word) for label, word in interventions.items()}
-    possible = []
+    possible: dict[str, str] = {}  # those of `interventions` that can be measured
     notes = []
     for label, arm in arms.items():
         why = lacking(
             arm, policy, channel, len(plan.lend), boundaries=in_simulation, n_goals=plan.n_goals
         )
         if why is None:
-            possible.append(label)
+            possible[label] = interventions[label]
         else:
             notes.append(f"{label} ({interventions[label]}) was left out: it needs {why}.")
     others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
@@ -226,7 +226,7 @@ def measure_card(
         )
 
     # In closed loop: every arm, then the matched run again with other noise.
-    plan = replace(plan, arms=[interventions[label] for label in possible], events=())
+    plan = replace(plan, arms=list(possible.values()), events=())
     run_probe(policy, replace(plan, recordings=()), folder, facts, settings, options)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
@@ -237,7 +237,7 @@ def measure_card(
     can_recover = policy.info.resamples and WRONG_SCENE in possible
     if plan.recordings and len(plan.lend) > 1 and can_recover:
         offline = replace(plan.offline, moments=None, scan=False)
-        wrong = replace(plan, arms=[interventions[WRONG_SCENE]], jobs=(), offline=offline)
+        wrong = replace(plan, arms=[possible[WRONG_SCENE]], jobs=(), offline=offline)
         run_probe(policy, wrong, folder, facts, settings, options)
         recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
     writing = None
@@ -269,7 +269,7 @@ def measure_card(
         grade(matched, outcomes, repeated),
         model=facts.model,
         checkpoint=facts.checkpoint,
-        interventions={label: interventions[label] for label in possible},
+        interventions=possible,
         suites=clock_scores(matched, outcomes, repeated, suites),
         recovery=recovered,
         references=success_of_references,

@@ -47,14 +47,10 @@ def compare_chunks(before: Tensor, after: Tensor) -> Change:
     second = after.double().flatten(1).numpy()
     across = _distances(first, second)
     within = _distances(first, first)
+    n = len(within)
+    spread = float(within.sum() / (n * (n - 1))) if n > 1 else 0.0  # between different rows
     energy = 2 * across.mean() - within.mean() - _distances(second, second).mean()
-    return Change(float(np.diagonal(across).mean()), std_of(within), float(max(energy, 0.0)))
-
-
-def std_of(distances: np.ndarray) -> float:
-    """Mean of the distances [n, n] between different rows; 0 for one row."""
-    n = len(distances)
-    return float(distances.sum() / (n * (n - 1))) if n > 1 else 0.0
+    return Change(float(np.diagonal(across).mean()), spread, float(max(energy, 0.0)))
 
 
 def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:

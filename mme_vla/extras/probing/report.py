@@ -374,7 +374,8 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording, columns: 
     recording: theirs.
     columns: frames a row.
     """
-    step, tiles = lines[0].step, []
+    step = lines[0].step
+    tiles = []
     for line in sorted(lines, key=lambda line: line.time):
         label = f"{line.age} ago: {line.change:.2f}"
         tiles.append(Tile(recording.frame(line.time), label, VIDEO if line.video else EXECUTION))

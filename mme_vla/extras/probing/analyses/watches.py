@@ -125,10 +125,11 @@ class AttentionWatch(Watch[AttentionMass]):
         self._watching = blocks[-1].expert == transformer.action_expert
         if not self._watching:
             return
-        names = [span.name for span in layout.spans]
-        self._names, self._lengths = names, [span.length for span in layout.spans]
+        self._names = [span.name for span in layout.spans]
+        self._lengths = [span.length for span in layout.spans]
         if not self._sums.ndim:
-            self._sums = torch.zeros(len(transformer.layers), len(names), dtype=torch.float64)
+            shape = (len(transformer.layers), len(layout.spans))
+            self._sums = torch.zeros(shape, dtype=torch.float64)
         self._mask = layout_mask(layout.mask_layout, torch.float32)
 
     @torch.no_grad()
