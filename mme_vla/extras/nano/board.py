@@ -250,8 +250,8 @@ class Board:
     @cached_property
     def sampled(self) -> dict[str, np.ndarray]:
         """`draws` over all tasks by row."""
-        names = [row.name for row in self.rows]
-        return dict(zip(names, self.draws(self.rows, self.protocol.tasks), strict=True))
+        draws = self.draws(self.rows, self.protocol.tasks)
+        return {row.name: sampled for row, sampled in zip(self.rows, draws, strict=True)}
 
     def interval(self, row: Row) -> Interval:
         """Of a row's success over all tasks, in percent; Wilson's where no draw differs."""
@@ -285,9 +285,7 @@ class Board:
             pairs = [pair for pair in pairs if pair[0].is_local or pair[1].is_local]
             floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
             for row in local:
-                for other in (ranked[0], *floors):
-                    if other is not row:
-                        pairs.append((other, row))
+                pairs += [(other, row) for other in (ranked[0], *floors) if other is not row]
         unique = {}
         for first, second in pairs:
             unique[frozenset((first.name, second.name))] = (first, second)
@@ -343,14 +341,14 @@ class Board:
             rows = [row for row in policies if row.budget == budget]
             if len(rows) < 2:
                 continue
-            tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
-            over_policies = holm([separation.p for separation in tasks])
+            tested = [self._separation(budget, task, rows) for task in self.protocol.tasks]
+            over_policies = holm([separation.p for separation in tested])
             # Whether trainings are enough for a test is the same for all tasks.
-            nested = [s.p_repeated for s in tasks if s.p_repeated is not None]
-            over_trainings: Sequence[float | None] = [None] * len(tasks)
-            if nested:
-                over_trainings = holm(nested)
-            corrected = zip(tasks, over_policies, over_trainings, strict=True)
+            p_trainings = [s.p_repeated for s in tested if s.p_repeated is not None]
+            over_trainings: Sequence[float | None] = [None] * len(tested)
+            if p_trainings:
+                over_trainings = holm(p_trainings)
+            corrected = zip(tested, over_policies, over_trainings, strict=True)
             for separation, p, p_repeated in corrected:
                 separations.append(replace(separation, p=p, p_repeated=p_repeated))
         return separations

@@ -102,14 +102,24 @@ def outcome_lines(
     lines = []
     for model, model_records in records.items():
         parts = []
-        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m")]
-        if measured:
-            centimetres = 100 * np.median(np.concatenate(measured))
+        distances = _position_errors(ends.get(model, ()))
+        if len(distances):
+            centimetres = 100 * np.median(distances)
             parts.append(f"off by {centimetres:.1f} cm on held-out decisions")
         won = sum(record.success for record in model_records)
         parts.append(f"{won} of {counted(len(model_records), 'episode')} solved")
         lines.append(f"{model}: {', '.join(parts)}")
     return lines
+
+
+def _position_errors(ends: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """How far off held-out decisions were in all trainings of a model, in metres; empty where none
+    was measured.
+    """
+    distances: list[float] = []
+    for end in ends:
+        distances += end.get("off_by_m") or ()
+    return np.array(distances)
 
 
 def compared(
@@ -206,9 +216,8 @@ def success_table(
             outcomes = [record.success for record in model_records if record.difficulty == level]
             cells.append(f"{sum(outcomes)}/{len(outcomes)}" if outcomes else "")
         # Distances on held-out decisions
-        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m")]
-        if measured:
-            distances = np.concatenate(measured)
+        distances = _position_errors(ends.get(model, ()))
+        if len(distances):
             within = 100 * np.mean(distances <= 0.02)
             cells += [f"{100 * np.median(distances):.1f} cm", f"{within:.0f} %"]
         else:

@@ -76,6 +76,7 @@ def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
     yield "hand", env.tcp_pose.p, [int(link.per_scene_id[0]) for link in env.agent.robot.links]
     lit = list(_lit_discs(env))
     lit_discs = [disc for _, disc in lit]
+    is_grasping = GRASP[0] < float(env.fingers.mean()) < GRASP[1]
     for thing in env.things:
         name = _class_of(thing)
         parts = (thing.head, thing.tail) if isinstance(thing, Peg) else (thing,)
@@ -85,7 +86,8 @@ def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
             yield name, position, ids
             if isinstance(thing, Button) and pressed(thing):
                 yield "pressed button", position, ids
-            if _in_gripper(env, name, position):
+            is_near = float(np.linalg.norm(position - env.tcp_pose.p)) < IN_HAND
+            if is_grasping and is_near and name.endswith(("cube", "container", "peg end")):
                 class_name = f"held {name}"
                 if class_name not in CLASSES:
                     class_name = "other held object"
@@ -131,12 +133,6 @@ def _lit_discs(env: "Task") -> Iterator[tuple[str, Any]]:
             disc = Thing(name, actor)
             if disc.position[2] > UNDER_THE_FLOOR:
                 yield kind, disc
-
-
-def _in_gripper(env: "Task", name: str, centre: np.ndarray) -> bool:
-    finger = float(env.fingers.mean())
-    near = float(np.linalg.norm(centre - env.tcp_pose.p)) < IN_HAND
-    return name.endswith(("cube", "container", "peg end")) and near and GRASP[0] < finger < GRASP[1]
 
 
 def visible_places(places: Sequence[Place], segmentation: np.ndarray) -> np.ndarray:
@@ -204,7 +200,8 @@ def record_scene(
         ).record()
         if arrangements:
             env.reset()
-        arm, rng = Arm(env.agent), np.random.default_rng(seed)
+        arm = Arm(env.agent)
+        rng = np.random.default_rng(seed)
         for _ in range(arrangements):
             _arrange(env, arm, rng)
             renders.take()
@@ -250,7 +247,8 @@ def _relocate(thing: Any, rng: np.random.Generator) -> None:
     """Turned and, three times of ten, where it was; now and then lifted; containers out of the way
     half of the time.
     """
-    name, home = _class_of(thing), thing.initial_pose
+    name = _class_of(thing)
+    home = thing.initial_pose
     if name == "container" and rng.random() < 0.5:
         return thing.move_away()
     if rng.random() < 0.3:

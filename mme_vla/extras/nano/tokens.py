@@ -46,7 +46,8 @@ class FrameTokens:
 
     def at(self, camera: str, frames: Sequence[int] | np.ndarray) -> Tensor:
         """The tokens [n, patches, d] of these frames."""
-        known, numbers = self.frames[camera], np.asarray(frames, np.int64)
+        known = self.frames[camera]
+        numbers = np.asarray(frames, np.int64)
         missing = sorted(set(numbers.tolist()) - set(known.tolist()))
         require(
             not missing,

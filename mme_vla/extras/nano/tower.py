@@ -125,7 +125,8 @@ class Residual(nn.Module):
 
 def build_stages(widths: Sequence[int], blocks: Sequence[int]) -> list[list[nn.Module]]:
     """The layers of each stage, the first on images: a strided convolution and residual blocks."""
-    stages, before = [], 3
+    stages = []
+    before = 3  # channels of an image
     for width, count, stride in zip(widths, blocks, STRIDES, strict=True):
         kernel = stride + 2 * (stride // 2)  # windows overlap: places know what is at their borders
         down = nn.Conv2d(before, width, kernel, stride, padding=(kernel - stride) // 2)
@@ -183,7 +184,8 @@ class PlaceTower(nn.Module):
         """
         side = images.shape[-1]
         # whole tokens, and at least one row of them
-        features, x = [], images[..., : max(1, round(side * IN_USE / 16)) * 16, :]
+        x = images[..., : max(1, round(side * IN_USE / 16)) * 16, :]
+        features = []
         for stage in self.stages:
             x = stage(x)
             features.append(x)
@@ -258,7 +260,8 @@ def reflect(tokens: Tensor, signs: Tensor, exchange: Tensor) -> Tensor:
         signs: of columns and rows, 1 or −1, [b, 2].
         exchange: whether column and row then change places, [b] bool.
     """
-    count, ones = 4 * len(CLASSES), [1] * (tokens.ndim - 2)
+    count = 4 * len(CLASSES)
+    ones = [1] * (tokens.ndim - 2)
     presence, share, column, row = tokens[..., :count].chunk(4, -1)
     column = column * signs[:, 0].view(-1, *ones, 1)
     row = row * signs[:, 1].view(-1, *ones, 1)

@@ -94,10 +94,15 @@ class ChoiceSession:
         clock: Callable[[], float] = time.perf_counter,
         max_steps: int | None = None,
     ) -> None:
-        self.env, self.episode, self.max_choices, self.images = env, episode, max_choices, images
+        self.env = env
+        self.episode = episode
+        self.max_choices = max_choices
+        self.images = images
         self._max_steps = max_steps
         self._motionless = 0  # choices that moved nothing
-        self.goal, self.status, self.error = "", "not started", ""
+        self.goal = ""
+        self.status = "not started"
+        self.error = ""
         self.ended_by = ""
         """What ended the episode where it was not the environment: `max_choices`, `max_steps`, or a
         player's reason.
@@ -108,7 +113,8 @@ class ChoiceSession:
         """What the environment returned last, for players that read more than images."""
         self.reveals: list[Reveal] = []
         self.decisions: list[Decision] = []
-        self._clock, self._displayed_at = clock, 0.0
+        self._clock = clock
+        self._displayed_at = 0.0
         self._begun = clock()
         self._simulated = self._policy_seconds = 0.0
 

@@ -247,11 +247,10 @@ def measure_card(
         notes.append(writing)
 
     # The scenes that are the same in every run.
-    unprobed = ended_scenes(folder / ONLINE / slug(UNPROBED.name), plan)
+    online = folder / ONLINE
+    unprobed = ended_scenes(online / slug(UNPROBED.name), plan)
     equal = ended_scenes(folder / AGAIN, plan)
-    probed = {}
-    for label in possible:
-        probed[label] = ended_scenes(folder / ONLINE / slug(arms[label].name), plan)
+    probed = {label: ended_scenes(online / slug(arms[label].name), plan) for label in possible}
     same = pair([unprobed, equal, *probed.values()])
     notes += same.gaps("The arms")
     require(same.keys or not same.left_out, " ".join(same.gaps("The arms")))
@@ -399,10 +398,7 @@ Scenes = dict[EpisodeKey, list[EpisodeRecord]]
 
 def _success(records: Scenes, keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, float]:
     """Success of these scenes."""
-    selected: list[EpisodeRecord] = []
-    for key in keys:
-        selected += records[key]
-    return outcomes_of(selected)
+    return outcomes_of(chain.from_iterable(records[key] for key in keys))
 
 
 def ended_scenes(folder: Path, plan: ProbePlan) -> Scenes:

@@ -123,8 +123,8 @@ class _Moments:
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
         """Run the episode once for arms with the same feed."""
         result: list[Line] = []
-        recording, first = self._recording, arms[0]
-        episode = first.start_episode(recording.goal, self._seed)
+        recording = self._recording
+        episode = arms[0].start_episode(recording.goal, self._seed)
         episode.recording = recording
         required = self._required_frames(arms)
         n_observed = 0
@@ -188,7 +188,8 @@ class _Moments:
         )
         result: list[Line] = []
         for (i, slot), chunk in zip(places, chunks, strict=True):
-            change, entry = compare_chunks(self._baseline[step], chunk), stores[i].entries[slot]
+            change = compare_chunks(self._baseline[step], chunk)
+            entry = stores[i].entries[slot]
             assert entry is not None
             result.append(
                 EntryLine(

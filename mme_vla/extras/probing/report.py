@@ -291,17 +291,15 @@ def decay(findings: Findings) -> str:
     """What an entry matters by its age, those of the video and of the execution."""
     with figure((5.6, 3.4)) as (canvas, (axes,)):
         for name, video, colour in (("video", True, COLOURS[0]), ("execution", False, COLOURS[1])):
-            points = findings.decay(video)
-            mine = [e for e in findings.entries if e.video == video]
-            if mine:
-                axes.scatter(
-                    [e.age for e in mine],
-                    [e.change for e in mine],
-                    s=12,
-                    color=colour,
-                    alpha=0.45,
-                    lw=0,
-                )
+            ages = []
+            changes = []
+            for entry in findings.entries:
+                if entry.video == video:
+                    ages.append(entry.age)
+                    changes.append(entry.change)
+            if ages:
+                axes.scatter(ages, changes, s=12, color=colour, alpha=0.45, lw=0)
+                points = findings.decay(video)
                 means = [point.change for _, point in points]
                 axes.plot([age for age, _ in points], means, "-o", color=colour, ms=5, label=name)
         stds = [entry.spread for entry in findings.entries]

@@ -314,7 +314,8 @@ class _Collector(Rollout):
     @torch.no_grad()
     def choose(self, batch: Sequence[RunningEpisode]) -> np.ndarray:
         """The chunks of the policy, or of the oracle where it acts; every decision is kept."""
-        policy, episodes = self.policy, [running.episode for running in batch]
+        policy = self.policy
+        episodes = [running.episode for running in batch]
         observations: list[Batch] = []
         paths: list[SamplePath] = []
 
@@ -358,7 +359,8 @@ class _Collector(Rollout):
         """Whether the oracle takes this decision; a function of seed, episode and number of the
         decision.
         """
-        job, number = running.job, len(self._decisions[running])
+        job = running.job
+        number = len(self._decisions[running])
         rng = np.random.default_rng([self.settings.seed, job.episode, number, *job.task.encode()])
         return bool(rng.random() < self.oracle_share)
 

@@ -190,7 +190,8 @@ def selection_sheets(
     history = OnlineHistory(memory.storage, memory.make_scorer(), start)
     patches = memory.storage.grid**2
     motion = normalised_states(source.states(episode, 0, length))
-    history.motion, history.state_width = motion.__getitem__, motion.shape[1]
+    history.motion = motion.__getitem__
+    history.state_width = motion.shape[1]
     n_observed = 0
     for step in range(start, length, every):
         part = frames[n_observed : step + 1]
