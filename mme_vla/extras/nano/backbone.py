@@ -257,11 +257,9 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         sizes = tower.widths, tower.blocks
         self.vision = PlaceTower(*sizes) if tower.layout == "places" else ConvTower(*sizes, width)
         self.goal_reader = GoalReader(config) if config.goal == "text" else None
-        self.spare = (
-            0
-            if self.goal_reader is None
-            else GOAL_QUERIES * self.vision.token_width // len(OBJECT_CLASSES)
-        )
+        self.spare = 0
+        if self.goal_reader is not None:
+            self.spare = GOAL_QUERIES * self.vision.token_width // len(OBJECT_CLASSES)
         self.vision_width = self.vision.token_width + self.spare
         initialise(self.vision)
         if tower.pretrained and self.vision.out.weight.device.type != "meta":
@@ -283,10 +281,9 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         )
         self.action_in = nn.Linear(config.action_dim, action_width)
         self.steps = nn.Embedding(config.horizon, action_width)
-        contexts = {**(extra_experts or {}), "vlm": config.vlm}
-        self.columns = nn.ModuleDict(
-            {name: Column(expert.width, config) for name, expert in contexts.items()}
-        )
+        self.columns = nn.ModuleDict()
+        for name, expert in {**(extra_experts or {}), "vlm": config.vlm}.items():
+            self.columns[name] = Column(expert.width, config)
         self.layers = nn.ModuleList(Reader(config) for _ in range(config.depth))
         self.final = RMSNorm(action_width)
         self.action_out = nn.Linear(action_width, config.action_dim)
@@ -360,15 +357,15 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         """Blocks `images`, of all views (`batch.view_tokens` where they were encoded before), and
         `prompt`.
         """
-        views, words = batch.images.shape[1], batch.prompt.shape[1]
+        views, n_words = batch.images.shape[1], batch.prompt.shape[1]
         require(
             views <= MAX_VIEWS,
             f"backbone=nano takes {MAX_VIEWS} cameras; embodiment.cameras names {views}.",
         )
         require(
-            words <= MAX_WORDS,
-            f"backbone=nano reads {MAX_WORDS} tokens of a prompt, and this one has {words}: shorten"
-            " the prompt format.",
+            n_words <= MAX_WORDS,
+            f"backbone=nano reads {MAX_WORDS} tokens of a prompt, and this one has {n_words}:"
+            " shorten the prompt format.",
         )
         tokens = self.condition_on_prompt(
             self._view_tokens(batch, views), batch.prompt, batch.prompt_mask
@@ -377,9 +374,10 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         located = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]
         encoded = located + self.see(located)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
+        words = self.embedding(batch.prompt) + self.positions.weight[:n_words]
         return [
             Block("images", encoded.flatten(1, 2), image_mask, "vlm"),
-            Block("prompt", self._words(batch.prompt), batch.prompt_mask, "vlm"),
+            Block("prompt", words, batch.prompt_mask, "vlm"),
         ]
 
     def _view_tokens(self, batch: Batch, views: int) -> Tensor:
@@ -389,10 +387,6 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
                 0, (-1, views)
             )
         return batch.view_tokens[:, :views].to(self.places.weight.dtype)
-
-    def _words(self, prompt: Tensor) -> Tensor:
-        words: Tensor = self.embedding(prompt) + self.positions.weight[: prompt.shape[1]]
-        return words
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, r, h, a] and flow times `time` [n, r], for r noisy versions a sample."""
@@ -453,13 +447,11 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
 
     def read_context(self, batch: Batch, injection: Injection) -> Context:
         """All that does not depend on the noise."""
-        visible = [
-            block for block in injection.blocks if block.name in injection.visibility["action"]
-        ]
+        names = injection.visibility["action"]
+        visible = [block for block in injection.blocks if block.name in names]
         keys_values = torch.cat([self.columns[block.expert](block.tokens) for block in visible], 3)
-        mask = additive_mask(
-            torch.cat([block.mask for block in visible], 1)[:, None], keys_values.dtype
-        )
+        block_mask = torch.cat([block.mask for block in visible], 1)
+        mask = additive_mask(block_mask[:, None], keys_values.dtype)
         (prompt,) = (block for block in injection.blocks if block.name == "prompt")
         words = self.prompt_in(prompt.tokens) * batch.prompt_mask[..., None]
         condition = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
@@ -469,11 +461,13 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
             condition = condition + self.goal_reader.condition(selected.flatten(1))
             if self.pointer is not None:
                 pointing = self._view_tokens(batch, 1)[:, 0], selected
-        has_memory = injection.hook is not None or any(
-            block.name not in ("images", "prompt") for block in visible
-        )
-        if batch.state is not None:
-            condition = condition + self.state_in(_waves(batch.state.float()))
+        added = {block.name for block in visible} - {"images", "prompt"}
+        has_memory = injection.hook is not None or bool(added)
+        if batch.state is not None:  # at several frequencies
+            frequencies = torch.tensor(STATE_FREQUENCIES, device=batch.state.device)
+            angles = batch.state.float()[..., None] * frequencies
+            waves = torch.cat([angles.sin(), angles.cos()], -1).flatten(1)
+            condition = condition + self.state_in(waves)
         return Context(keys_values, mask, condition, injection.hook, pointing, has_memory)
 
     def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
@@ -484,8 +478,14 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         output: Tensor = self.action_out(x)
         if self.pointer is not None:
             assert context.pointing is not None
-            read = (part.repeat_interleave(versions, 0) for part in context.pointing)
-            output = torch.cat([output, self.pointer(x, *read, context.has_memory)], -1)
+            tokens, selected = context.pointing
+            components = self.pointer(
+                x,
+                tokens.repeat_interleave(versions, 0),
+                selected.repeat_interleave(versions, 0),
+                context.has_memory,
+            )
+            output = torch.cat([output, components], -1)
         return output.float()
 
     def act(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
@@ -525,9 +525,3 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
 
     def recompute(self, mode: Recompute) -> None:
         """No effect: a layer's activations are a chunk's few tokens."""
-
-
-def _waves(state: Tensor) -> Tensor:
-    """Sin and cos of a state [b, s] at several frequencies, [b, 8·s]."""
-    angles = state[..., None] * torch.tensor(STATE_FREQUENCIES, device=state.device)
-    return torch.cat([angles.sin(), angles.cos()], -1).flatten(1)

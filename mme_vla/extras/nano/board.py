@@ -230,15 +230,19 @@ class Board:
         """Deviation of success between trainings of one row, without the variance of single
         episodes.
         """
-        repeated = [row for row in rows if len(row.method.trainings) > 1]
-        if not repeated:
-            return 0.0
-        noise = pooled([row.mean(tasks) for row in repeated]) or 0.0
-        # The variance of single episodes, in points of the mean over tasks and episodes
+        success: list[np.ndarray] = []
         variances: list[float] = []
-        for row in repeated:
-            variances.append(sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks))
-        degrees = [len(row.method.trainings) - 1 for row in repeated]
+        degrees: list[int] = []
+        for row in rows:
+            n_trainings = len(row.method.trainings)
+            if n_trainings > 1:
+                success.append(row.mean(tasks))
+                variances.append(sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks))
+                degrees.append(n_trainings - 1)
+        if not success:
+            return 0.0
+        noise = pooled(success) or 0.0
+        # The variance of single episodes, in points of the mean over tasks and episodes
         points = 100 / len(tasks) / self.protocol.episodes
         of_episodes = np.average(variances, weights=degrees) * points**2
         return float(max(0.0, noise**2 - of_episodes) ** 0.5)
@@ -246,8 +250,8 @@ class Board:
     @cached_property
     def sampled(self) -> dict[str, np.ndarray]:
         """`draws` over all tasks by row."""
-        names = [row.name for row in self.rows]
-        return dict(zip(names, self.draws(self.rows, self.protocol.tasks), strict=True))
+        draws = self.draws(self.rows, self.protocol.tasks)
+        return {row.name: sampled for row, sampled in zip(self.rows, draws, strict=True)}
 
     def interval(self, row: Row) -> Interval:
         """Of a row's success over all tasks, in percent; Wilson's where no draw differs."""
@@ -282,7 +286,9 @@ class Board:
             floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
             for row in local:
                 pairs += [(other, row) for other in (ranked[0], *floors) if other is not row]
-        unique = {frozenset((first.name, second.name)): (first, second) for first, second in pairs}
+        unique = {}
+        for first, second in pairs:
+            unique[frozenset((first.name, second.name))] = (first, second)
         return self._compared(list(unique.values()))
 
     def variants(self, part: Literal["memory", "integration"]) -> list[Comparison]:
@@ -293,11 +299,15 @@ class Board:
         rows = [row for row in self.of_kind("policy") if not row.budget and not row.is_local]
         parts = {row.name: row.name.rpartition("_")[::2] for row in rows}
         count = Counter(memory for memory, _ in parts.values())
-        rows = [row for row in rows if parts[row.name][0] and count[parts[row.name][0]] > 1]
+        several = []
+        for row in rows:
+            memory, _ = parts[row.name]
+            if memory and count[memory] > 1:
+                several.append(row)
         varied = ("memory", "integration").index(part)
-        rows.sort(key=lambda row: parts[row.name][1 - varied])
+        several.sort(key=lambda row: parts[row.name][1 - varied])
         pairs = []
-        for first, second in combinations(rows, 2):
+        for first, second in combinations(several, 2):
             mine, other = parts[first.name], parts[second.name]
             if mine[varied] != other[varied] and mine[1 - varied] == other[1 - varied]:
                 pairs.append((first, second))
@@ -331,14 +341,14 @@ class Board:
             rows = [row for row in policies if row.budget == budget]
             if len(rows) < 2:
                 continue
-            tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
-            over_policies = holm([separation.p for separation in tasks])
+            tested = [self._separation(budget, task, rows) for task in self.protocol.tasks]
+            over_policies = holm([separation.p for separation in tested])
             # Whether trainings are enough for a test is the same for all tasks.
-            nested = [s.p_repeated for s in tasks if s.p_repeated is not None]
-            over_trainings: Sequence[float | None] = [None] * len(tasks)
-            if nested:
-                over_trainings = holm(nested)
-            corrected = zip(tasks, over_policies, over_trainings, strict=True)
+            p_trainings = [s.p_repeated for s in tested if s.p_repeated is not None]
+            over_trainings: Sequence[float | None] = [None] * len(tested)
+            if p_trainings:
+                over_trainings = holm(p_trainings)
+            corrected = zip(tested, over_policies, over_trainings, strict=True)
             for separation, p, p_repeated in corrected:
                 separations.append(replace(separation, p=p, p_repeated=p_repeated))
         return separations
@@ -348,15 +358,18 @@ class Board:
         return max((self.success(row, [task]) for row in self.of_kind(kind)), default=None)
 
     def _separation(self, budget: str, task: str, rows: Sequence[Row]) -> Separation:
-        trainings = [row.mean([task]) for row in rows]
-        means = np.array([of_row.mean() for of_row in trainings])
+        success: list[np.ndarray] = []  # of each memory, that of its trainings in percent
+        outcomes: list[np.ndarray] = []  # of each memory, [scenes, trainings]
+        for row in rows:
+            success.append(row.mean([task]))
+            outcomes.append(row.outcomes(task))
+        means = np.array([of_row.mean() for of_row in success])
+        n_trainings = np.array([len(of_row) for of_row in success])
         # Of the variance between memories, trainings add 1/n of that between trainings.
-        noise = pooled(trainings)
-        shares = [1 / len(of_row) for of_row in trainings]
-        variance = means.var(ddof=1) - (noise or 0) ** 2 * np.mean(shares)
-        outcomes = [row.outcomes(task) for row in rows]
+        noise = pooled(success)
+        variance = means.var(ddof=1) - (noise or 0) ** 2 * np.mean(1 / n_trainings)
         repeated = [of_row for of_row in outcomes if of_row.shape[1] > 1]
-        smallest = smallest_p([of_row.shape[1] for of_row in repeated])
+        smallest = smallest_p(n_trainings[n_trainings > 1].tolist())
         p_repeated = None
         if smallest * len(self.protocol.tasks) < 0.05:
             p_repeated = homogeneity(repeated, over_trainings=True)
@@ -381,7 +394,11 @@ class Board:
         """The rows that the paper reports, its best first; none on a board of other tasks."""
         if not set(self.protocol.tasks) <= set(PAPER_ORDER):
             return []
-        known = [(row, method) for row in self.rows if (method := row.paper) is not None]
+        known = []
+        for row in self.rows:
+            method = row.paper
+            if method is not None:
+                known.append((row, method))
         return sorted(known, key=lambda pair: -published_success(pair[1], PAPER_ORDER))
 
     def agreements(self) -> list[Agreement]:
@@ -400,21 +417,21 @@ class Board:
         compared.insert(1, ("average, memories alone", self.protocol.tasks, memories))
         made = []
         for name, tasks, pairs in compared:
-            rows = [row for row, _ in pairs]
-            means = np.array([self.success(row, tasks) for row in rows])
+            if len(pairs) < 3:
+                continue
+            means = np.array([self.success(row, tasks) for row, _ in pairs])
             reported = np.array([published_success(method, tasks) for _, method in pairs])
-            if len(rows) > 2 and np.ptp(means) and np.ptp(reported):
-                draws = self.draws(rows, tasks).T
-                made.append(
-                    Agreement(
-                        name,
-                        len(rows),
-                        float(spearman(means, reported)),
-                        percentiles(spearman(draws, reported)),
-                        float(kendall(means, reported)),
-                        percentiles(kendall(draws, reported)),
-                    )
+            if np.ptp(means) and np.ptp(reported):
+                draws = self.draws([row for row, _ in pairs], tasks).T
+                agreement = Agreement(
+                    name,
+                    len(pairs),
+                    float(spearman(means, reported)),
+                    percentiles(spearman(draws, reported)),
+                    float(kendall(means, reported)),
+                    percentiles(kendall(draws, reported)),
                 )
+                made.append(agreement)
         return made
 
     def targets(self) -> list[Target]:
@@ -478,11 +495,11 @@ class Board:
 def _row(name: str, trainings: Sequence[Training], protocol: Protocol) -> Row:
     # of all: in a row other data are another recording, not another method
     data = trainings[0].facts.data
-    records = [
-        replace(record, training=record.training and replace(record.training, data=data))
-        for training in trainings
-        for record in training.records
-    ]
+    records = []
+    for training in trainings:
+        for record in training.records:
+            identity = record.training and replace(record.training, data=data)
+            records.append(replace(record, training=identity))
     methods = aggregate(records, protocol).methods
     require(
         len(methods) == 1,

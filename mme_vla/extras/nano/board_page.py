@@ -68,11 +68,18 @@ def tasks(board: Board) -> Table:
 
 def trainings(board: Board) -> Table:
     """Scenes that each training solves, of rows with several: in all, by suite and by task."""
-    suites = [tuple(board.protocol.choose("suite", suite)) for suite in board.protocol.suites]
-    scopes = [board.protocol.tasks, *suites, *[(task,) for task in board.protocol.tasks]]
+    scopes = [board.protocol.tasks]
+    for suite in board.protocol.suites:
+        scopes.append(tuple(board.protocol.choose("suite", suite)))
+    for task in board.protocol.tasks:
+        scopes.append((task,))
     rows: list[list[str]] = []
     for row in board.rows:
-        seeds = [runs[0].key.training.seed for runs in row.method.trainings if runs[0].key.training]
+        seeds = []
+        for runs in row.method.trainings:
+            identity = runs[0].key.training
+            if identity is not None:
+                seeds.append(identity.seed)
         if len(seeds) < 2:
             continue
         solved_by_task = {task: row.outcomes(task).sum(0) for task in board.protocol.tasks}
@@ -155,12 +162,13 @@ def published(board: Board) -> Table:
     scopes: dict[str, Sequence[str]] = {"all": board.protocol.tasks}
     for suite in board.protocol.suites:
         scopes[suite] = board.protocol.choose("suite", suite)
-    rows = [[row.name] for row, _ in board.published]
+    pairs = board.published
+    rows = [[row.name] for row, _ in pairs]
     columns = ["row"]
     for name, scope in scopes.items():
         columns += [f"{name}, here", f"{name}, paper"]
-        measured = np.array([board.success(row, scope) for row, _ in board.published])
-        reported = np.array([published_success(method, scope) for _, method in board.published])
+        measured = np.array([board.success(row, scope) for row, _ in pairs])
+        reported = np.array([published_success(method, scope) for _, method in pairs])
         for i, cells in enumerate(rows):
             for values in (measured, reported):
                 place = 1 + (values > values[i]).sum()
@@ -170,17 +178,15 @@ def published(board: Board) -> Table:
 
 def agreements(board: Board) -> Table:
     """Rank correlations with the published ranking."""
-    rows = [
-        [
-            a.scope,
-            str(a.methods),
-            f"{a.spearman:+.2f}",
-            "[{:+.2f}, {:+.2f}]".format(*a.spearman_interval),
-            f"{a.kendall:+.2f}",
-            "[{:+.2f}, {:+.2f}]".format(*a.kendall_interval),
-        ]
-        for a in board.agreements()
-    ]
+    rows = []
+    for a in board.agreements():
+        row = [a.scope, str(a.methods)]
+        for value, interval in (
+            (a.spearman, a.spearman_interval),
+            (a.kendall, a.kendall_interval),
+        ):
+            row += [f"{value:+.2f}", f"[{interval.low:+.2f}, {interval.high:+.2f}]"]
+        rows.append(row)
     return Table(
         "Rank correlation with the published success",
         ["", "methods", "Spearman", "95 %", "Kendall", "95 %"],
@@ -191,7 +197,10 @@ def agreements(board: Board) -> Table:
 def targets(board: Board) -> Table:
     """The benchmark's targets, reached or not."""
     words = {None: "", True: "yes", False: "no"}
-    rows = [[t.name, t.measured, t.interval, t.test, words[t.reached]] for t in board.targets()]
+    rows = []
+    for target in board.targets():
+        reached = words[target.reached]
+        rows.append([target.name, target.measured, target.interval, target.test, reached])
     return Table("Targets", ["target", "measured", "95 %", "better : worse", "reached"], rows)
 
 
@@ -224,16 +233,18 @@ def notes(board: Board) -> list[str]:
             " These rows have the same tasks, numbers and seeds, and are compared by score,"
             " unpaired."
         )
+    recordings: set[str] = set()
+    several = 0
     for row in board.rows:
+        recordings |= row.recordings
+        several += len(row.recordings) > 1
         if errors := sum(run.outcomes["error"] for run in row.method.runs):
             lines.append(
                 f"{row.name}: {counted(errors, 'failure')} by an error of the environment or the"
                 " policy."
             )
     lines += missing_baselines(row.name for row in board.rows)
-    recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
     if len(recordings) > 1:
-        several = sum(len(row.recordings) > 1 for row in board.rows)
         lines.append(
             f"{len(recordings)} recordings of the demonstrations (digests"
             f" {listed(sorted(recordings))}). Rows with trainings on more than one: {several}"
@@ -286,22 +297,32 @@ def budget_figure(board: Board) -> str:
     several = {model: rows for model, rows in models.items() if len(rows) > 1}
     if not several:
         return ""
+    every_budget: set[int] = set()
     with figure((5.6, 3.6)) as (canvas, (axes,)):
         for number, (model, rows) in enumerate(several.items()):
-            rows.sort(key=lambda row: row.facts.budget or 0)
-            means = np.array([board.success(row) for row in rows])
-            low, high = np.array([board.interval(row) for row in rows]).T
+            budgets = []
+            means = []
+            below = []  # from a mean to the lower end of its interval
+            above = []
+            for row in sorted(rows, key=lambda row: row.facts.budget or 0):
+                mean = board.success(row)
+                low, high = board.interval(row)
+                budgets.append(row.facts.budget or 0)
+                means.append(mean)
+                below.append(max(mean - low, 0))
+                above.append(max(high - mean, 0))
+            every_budget.update(budgets)
             axes.errorbar(
-                [row.facts.budget or 0 for row in rows],
+                budgets,
                 means,
-                np.maximum([means - low, high - means], 0),
+                [below, above],
                 fmt="-o",
                 ms=5,
                 capsize=3,
                 color=COLOURS[number % len(COLOURS)],
                 label=model,
             )
-        log_scale(axes.xaxis, {row.facts.budget or 0 for rows in several.values() for row in rows})
+        log_scale(axes.xaxis, every_budget)
         axes.set_xlabel("memory tokens")
         axes.set_ylabel("success (%)")
         axes.set_ylim(bottom=0)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.waypoints import Motions
-from mme_vla.embodiment.action_space import Option, read_options
+from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_state
 from mme_vla.envs.facts import Fact
 from mme_vla.envs.make import make_task
@@ -213,7 +213,10 @@ def frames_required(
         read.update(choice.read(frames, exec_start))
     if not choices:
         decided.update(decisions.tolist())
-    return {camera: decided | read if camera == "front" else decided for camera in cameras}
+    required = dict.fromkeys(cameras, decided)
+    if "front" in required:
+        required["front"] = decided | read
+    return required
 
 
 def demonstrated(scene: Scene) -> bool:
@@ -279,7 +282,8 @@ def record(
                 images[camera][frame] = read_images(env, camera, rgb=True)["rgb"]
         goal = env.goals()[0].lower()
         if chooser is not None:
-            goal = chooser.worded(goal, _options(env, chooser))
+            options = [choice.option.to_dict() for choice in env.choices()]
+            goal = chooser.worded(goal, read_options(options, len(chooser.choice)))
         subgoals = {kind: _subgoal_texts(taken.texts, motions.decisions, kind) for kind in SUBGOALS}
         return Demonstration(
             type(env).__name__,
@@ -322,11 +326,10 @@ class _Taken:
         self.texts.append(info)
         self.states.append(benchmark_state(observed["joint_state"], observed["gripper_state"]))
         self.video += in_video
-        self._snapshots.append((
-            [entity.pose for entity in self._entities],
-            [body.visibility for body in self._bodies],
-            [(each.root_pose, each.qpos) for each in self._articulations],
-        ))  # fmt: skip
+        poses = [entity.pose for entity in self._entities]
+        visibilities = [body.visibility for body in self._bodies]
+        joints = [(each.root_pose, each.qpos) for each in self._articulations]
+        self._snapshots.append((poses, visibilities, joints))
 
     def _find_objects(self) -> None:
         from sapien.render import RenderBodyComponent
@@ -353,12 +356,6 @@ class _Taken:
         for each, (root, qpos) in zip(self._articulations, joints, strict=True):
             each.root_pose = root
             each.qpos = qpos
-
-
-def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
-    """What a task offers to choose from."""
-    options = [choice.option.to_dict() for choice in env.choices()]
-    return read_options(options, len(chooser.choice))
 
 
 def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
@@ -428,5 +425,8 @@ def _boundaries(texts: Sequence[Mapping[str, Any]]) -> np.ndarray:
     `data.columns`.
     """
     subgoals = [text.get("simple_subgoal", text.get("simple_subgoal_online")) for text in texts]
-    frames = [0] + [i for i in range(1, len(subgoals)) if subgoals[i] != subgoals[i - 1]]
+    frames = [0]
+    for frame in range(1, len(subgoals)):
+        if subgoals[frame] != subgoals[frame - 1]:
+            frames.append(frame)
     return np.array(frames, np.int64)

@@ -219,11 +219,10 @@ def play_all(
     file = folder / RECORDS
     known = {record.key for record in read_records(file)} if file.is_file() else set()
     selected = {EpisodeKey(spec.task, spec.episode): spec for spec in specs}
-    missing = [
-        Play(name, spec, rules, moves.get(spec.task, ()))
-        for key, spec in selected.items()
-        if key not in known
-    ]
+    missing = []
+    for key, spec in selected.items():
+        if key not in known:
+            missing.append(Play(name, spec, rules, moves.get(spec.task, ())))
     with RecordLog(file) as log:
         for record in carry_out(missing, play_episode, rules.workers):
             log.append(record)
@@ -307,9 +306,10 @@ def record_videos(
     """
     alone = replace(rules, workers=1, shard=None)
     for name, won in (("success", True), ("failure", False)):
-        record = next((record for record in records if record.success is won), None)
-        if record is not None:
-            specs = choose_episodes(record.task, [record.episode], record.split)
+        outcomes = [record for record in records if record.success is won]
+        if outcomes:
+            first = outcomes[0]
+            specs = choose_episodes(first.task, [first.episode], first.split)
             run_checkpoint(checkpoint, folder / name, specs, alone, video="all")
     return sorted(folder.glob(f"*/{VIDEOS}/*.mp4"))
 
@@ -331,15 +331,20 @@ def built_scenes(
         built: list[EpisodeSpec] = []
         untried: list[EpisodeSpec] = []
         for task in choose_tasks(tasks):
-            specs = source.episodes(task, split)
-            good = [spec for spec in specs if tried.get(_key(spec)) == ""][:count]
-            fresh = [spec for spec in specs if _key(spec) not in tried]
-            n_missing = count - len(good)
+            good: list[EpisodeSpec] = []
+            fresh: list[EpisodeSpec] = []
+            for spec in source.episodes(task, split):
+                reason = tried.get(_key(spec))
+                if reason is None:
+                    fresh.append(spec)
+                elif not reason:
+                    good.append(spec)
+            n_missing = max(count - len(good), 0)
             require(
                 len(fresh) >= n_missing,
                 f"{task}: of split {split} fewer than {count} scenes can be built.",
             )
-            built += good
+            built += good[:count]
             untried += fresh[:n_missing]
         if not untried:
             break

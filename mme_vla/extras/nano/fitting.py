@@ -148,14 +148,13 @@ class Training:
         data = identify(now, self.content)["data"]
         if about["data"] != data:
             changed["the demonstrations' digest"] = (about["data"], data)
+        differences = []
+        for key, (old, new) in changed.items():
+            differences.append(f"{key} was {brief(old)}, and is {brief(new)}")
         require(
-            not changed,
-            f"{self.folder} holds a training with other settings: "
-            + listed(
-                f"{key} was {brief(old)}, and is {brief(new)}"
-                for key, (old, new) in changed.items()
-            )
-            + ". Choose another output, or move that folder away.",
+            not differences,
+            f"{self.folder} holds a training with other settings: {listed(differences)}. Choose"
+            " another output, or move that folder away.",
         )
         return True
 
@@ -350,12 +349,12 @@ def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
     measured = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
     learnt = [file for file in files if file not in measured] or files  # there may be one alone
     processor = policy.require_processor()
-    processor.stats = statistics(
-        (Demonstration.load(file, images=False) for file in learnt), policy
-    )
+    demonstrations = (Demonstration.load(file, images=False) for file in learnt)
+    processor.stats = statistics(demonstrations, policy)
 
     def read(some: Sequence[Path]) -> Iterator[tuple[Demonstration, FrameTokens]]:
-        return ((Demonstration.load(file, images=False), job.store.read(file)) for file in some)
+        for file in some:
+            yield Demonstration.load(file, images=False), job.store.read(file)
 
     samples = Decisions.of(
         policy,

@@ -133,13 +133,14 @@ class Reflection:
     def __call__(self, batch: Batch, rows: Sequence[int]) -> Batch:
         """The batch of these decisions with its objects elsewhere, as chosen by the rows."""
         generator = generator_for("reflection", *map(int, rows))
-        changes = (torch.rand(3, len(rows), generator=generator) < self.p) & ~self.fixed[
-            torch.as_tensor(list(rows))
-        ]
-        signs, exchange = torch.where(changes[:2], -1.0, 1.0).T, changes[2]
+        changes = torch.rand(3, len(rows), generator=generator) < self.p
+        changes = changes & ~self.fixed[torch.as_tensor(list(rows))]
+        signs = torch.where(changes[:2], -1.0, 1.0).T
+        exchange = changes[2]
         assert batch.view_tokens is not None and batch.actions is not None
         low, high = self.bounds
-        actions, half = batch.actions.clone(), (high - low) / 2
+        half = (high - low) / 2
+        actions = batch.actions.clone()
         points = actions[..., self.columns]
         reflected = (reflect_points((points + 1) * half + low, signs, exchange) - low) / half - 1
         # the others stay equal to the last bit
@@ -369,7 +370,8 @@ def choice_errors(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Choic
     points = recorded[:, list(space.point)]
     needed = (points - torch.tensor(MIDDLE)).abs().amax(1) > 1e-6
     off = (predicted[:, list(space.point)] - points)[needed].norm(dim=1)
-    near, of_points = (off < NEAR).numpy(), tasks[needed.numpy()]
+    near = (off < NEAR).numpy()
+    of_points = tasks[needed.numpy()]
     return ChoiceErrors(
         {task: float(right[tasks == task].mean()) for task in dict.fromkeys(tasks.tolist())},
         {task: float(near[of_points == task].mean()) for task in dict.fromkeys(of_points.tolist())},
@@ -396,8 +398,9 @@ def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> No
 def _items(
     policy: MMEPolicy, demonstration: Demonstration, history: History | None, made: FrameTokens
 ) -> list[dict[str, Any]]:
-    processor, cameras = policy.require_processor(), policy.embodiment.camera_names
+    processor = policy.require_processor()
     decisions = _decisions(policy, demonstration)
+    cameras = policy.embodiment.camera_names
     view_tokens = torch.stack([made.at(name, decisions) for name in cameras], 1)
     subgoals = _subgoals(policy, demonstration)[:: policy.embodiment.action.execute]
     items = []
@@ -422,9 +425,9 @@ def _items(
 
 
 def _decisions(policy: MMEPolicy, demonstration: Demonstration) -> list[int]:
-    return [
-        int(frame) for frame in demonstration.motions.decisions[:: policy.embodiment.action.execute]
-    ]
+    every = policy.embodiment.action.execute
+    decisions: list[int] = demonstration.motions.decisions[::every].tolist()
+    return decisions
 
 
 def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens) -> History | None:
@@ -443,9 +446,11 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
         # An action is a motion of many frames here, so the states alone tell what was done.
         length = demonstration.length
         nothing = np.zeros((length, policy.embodiment.action.width), np.float32)
-        states, unknown = demonstration.states[:length], np.zeros(length, bool)
+        states = demonstration.states[:length]
+        unknown = np.zeros(length, bool)
         motion = motion_rows(policy.require_processor(), states, nothing, unknown)
-        history.motion, history.state_width = motion.__getitem__, policy.embodiment.state.width
+        history.motion = motion.__getitem__
+        history.state_width = policy.embodiment.state.width
     return history
 
 

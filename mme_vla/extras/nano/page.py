@@ -56,6 +56,11 @@ def write_page(
     demonstrations: how many they learned from.
     """
     results, comparisons = compared(records, nano.task, nano.split, without)
+    lead = [comparison.verdict for comparison in comparisons]
+    if not lead:  # there is no other model to compare the first one with
+        first = next(iter(records.values()))
+        won = sum(record.success for record in first)
+        lead = [f"{first[0].model} {won} of {counted(len(first), 'episode')}"]
     ends = ends_of(runs)
     curves: dict[str, list[dict[str, float]]] = {}
     for model, folders in runs.items():
@@ -71,7 +76,7 @@ def write_page(
         without=without,
         success=success_table(records, ends, results),
         comparison=to_markdown(pairs_table(comparisons)) if comparisons else "",
-        lead=[comparison.verdict for comparison in comparisons] or [solved(records)],
+        lead=lead,
         notes=results.notes,
         minutes={stage: spent for stage, spent in minutes.items() if round(spent, 1) > 0},
         curves=CURVES if has_curves else None,
@@ -97,9 +102,9 @@ def outcome_lines(
     lines = []
     for model, model_records in records.items():
         parts = []
-        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m")]
-        if measured:
-            centimetres = 100 * np.median(np.concatenate(measured))
+        distances = _position_errors(ends.get(model, ()))
+        if len(distances):
+            centimetres = 100 * np.median(distances)
             parts.append(f"off by {centimetres:.1f} cm on held-out decisions")
         won = sum(record.success for record in model_records)
         parts.append(f"{won} of {counted(len(model_records), 'episode')} solved")
@@ -107,11 +112,14 @@ def outcome_lines(
     return lines
 
 
-def solved(records: Mapping[str, Sequence[EpisodeRecord]]) -> str:
-    """What the first model solved, where there is no other to compare it with."""
-    first = next(iter(records.values()))
-    won = sum(record.success for record in first)
-    return f"{first[0].model} {won} of {counted(len(first), 'episode')}"
+def _position_errors(ends: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """How far off held-out decisions were in all trainings of a model, in metres; empty where none
+    was measured.
+    """
+    distances: list[float] = []
+    for end in ends:
+        distances += end.get("off_by_m") or ()
+    return np.array(distances)
 
 
 def compared(
@@ -124,7 +132,8 @@ def compared(
     """
     # A protocol numbers its episodes from 0; the scenes that can be built have gaps.
     pooled = list(chain.from_iterable(records.values()))
-    numbers = {n: i for i, n in enumerate(sorted({record.episode for record in pooled}))}
+    episodes = sorted({record.episode for record in pooled})
+    numbers = {episode: number for number, episode in enumerate(episodes)}
     protocol = Protocol((task,), len(numbers))
     renumbered = [replace(record, episode=numbers[record.episode]) for record in pooled]
     results = aggregate(renumbered, protocol, split)
@@ -207,9 +216,8 @@ def success_table(
             outcomes = [record.success for record in model_records if record.difficulty == level]
             cells.append(f"{sum(outcomes)}/{len(outcomes)}" if outcomes else "")
         # Distances on held-out decisions
-        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m")]
-        if measured:
-            distances = np.concatenate(measured)
+        distances = _position_errors(ends.get(model, ()))
+        if len(distances):
             within = 100 * np.mean(distances <= 0.02)
             cells += [f"{100 * np.median(distances):.1f} cm", f"{within:.0f} %"]
         else:
@@ -231,13 +239,16 @@ def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path)
     from matplotlib.ticker import MaxNLocator
 
     measured: dict[str, list[tuple[float, float]]] = {}
+    losses: list[float] = []
+    every_step: set[float] = set()
     for model, curve in curves.items():
-        points = [(line["step"], line["val/loss"]) for line in curve if "val/loss" in line]
-        if points:
-            measured[model] = points
+        for line in curve:
+            if "val/loss" in line:
+                measured.setdefault(model, []).append((line["step"], line["val/loss"]))
+                losses.append(line["val/loss"])
+                every_step.add(line["step"])
     if not measured:
         return False
-    losses = [loss for points in measured.values() for _, loss in points]
     with figure((6.4, 3.4)) as (canvas, (axes,)):
         for model, points in measured.items():
             # A line of few points shows which of it was measured.
@@ -248,9 +259,8 @@ def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path)
         else:
             axes.set_ylim(bottom=0)
             axes.yaxis.set_major_formatter("{x:g}")
-        steps = sorted({step for points in measured.values() for step, _ in points})
-        if len(steps) <= FEW_POINTS // 2:
-            axes.set_xticks(steps)
+        if len(every_step) <= FEW_POINTS // 2:
+            axes.set_xticks(sorted(every_step))
         else:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.xaxis.set_major_formatter("{x:,.0f}")

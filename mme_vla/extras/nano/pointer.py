@@ -109,9 +109,7 @@ class Pointer(nn.Module):
             summed = torch.einsum("bqk,bnkw,bn->bqw", selected.float(), waves, history.mask.float())
             n_objects = summed[..., :1]  # the first wave counts them
             # A token of a whole frame is the mean of the tower's 64.
-            target, is_known = (
-                summed / n_objects.clamp(min=1e-6),
-                n_objects[..., 0] > MIN_OBJECTS / 64,
-            )
+            target = summed / n_objects.clamp(min=1e-6)
+            is_known = n_objects[..., 0] > MIN_OBJECTS / 64
         error = (self.predict_maps(actions).float() - target[:, None]).square().mean((1, 3))
         return (error * is_known).sum(1) / is_known.sum(1).clamp(min=1)

@@ -75,7 +75,9 @@ class Scenes:
     def load(cls, files: Sequence[Path]) -> "Scenes":
         """Read recorded scenes."""
         require(files, "There is no recorded scene to learn from.")
-        images, rows, count = [], [], 0
+        images = []
+        rows = []
+        count = 0
         for file in files:
             with np.load(file) as scene:
                 images.append(torch.from_numpy(scene["images"]).permute(0, 3, 1, 2))
@@ -83,11 +85,10 @@ class Scenes:
             count += len(images[-1])
         table = np.concatenate(rows)
         pixels = np.stack([project(centre)[::-1] for centre in table[:, 2:]]) / SIDE
-        owners, classes = (torch.from_numpy(table[:, i].astype(np.int64)) for i in (0, 1))
         return cls(
             torch.cat(images),
-            owners,
-            classes,
+            torch.from_numpy(table[:, 0].astype(np.int64)),
+            torch.from_numpy(table[:, 1].astype(np.int64)),
             table[:, 2:],
             torch.from_numpy(pixels.astype(np.float32)),
         )
@@ -136,10 +137,8 @@ def label_cells(
         shape: images b and cells g a side.
     """
     images, side = shape
-    presence, offsets = (
-        torch.zeros(images, len(CLASSES), side, side),
-        torch.zeros(images, len(CLASSES), 2, side, side),
-    )
+    presence = torch.zeros(images, len(CLASSES), side, side)
+    offsets = torch.zeros(images, len(CLASSES), 2, side, side)
     nearest = torch.full_like(presence, math.inf)
     where = places * side - 0.5  # in cells, from the first one's centre
     for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -170,7 +169,7 @@ def augmented(
         images: [b, 3, s, s].
         places: [m, 2] in them, of the images `batch` [m].
     """
-    right, down = (int(n) for n in rng.integers(-SHIFT, SHIFT + 1, 2))
+    right, down = rng.integers(-SHIFT, SHIFT + 1, 2).tolist()
     side = images.shape[-1]
     padded = functional.pad(images, (SHIFT,) * 4, mode="replicate")
     shifted = padded[..., SHIFT - down : SHIFT - down + side, SHIFT - right : SHIFT - right + side]
@@ -330,8 +329,12 @@ def find_objects(presence: Tensor, offsets: Tensor) -> list[tuple[float, float]]
             objects[nearest] = total + vote * place, count + vote
         else:
             objects.append((vote * place, vote))
-    means = [total / count / len(presence) for total, count in objects if count >= VOTES]
-    return [(float(column), float(row)) for column, row in means]
+    means = []
+    for total, count in objects:
+        if count >= VOTES:
+            column, row = (total / count / len(presence)).tolist()
+            means.append((column, row))
+    return means
 
 
 def on_plane(place: tuple[float, float], height: float) -> np.ndarray:

@@ -142,16 +142,15 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
             f" {trainings[0].rules}. Rows of one board have the same.",
         )
         scenes, expected = training.scenes, trainings[0].scenes
-        if scenes != expected:
-            differing = [
-                f"{key.task} {key.episode}"
-                for key in sorted(scenes | expected)
-                if scenes.get(key) != expected.get(key)
-            ]
-            raise UserError(
-                f"{training.folder} and {trainings[0].folder} have different scenes or step limits:"
-                f" {listed(differing)}. Rows of one board have the same."
-            )
+        differing = []
+        for key in sorted(scenes | expected):
+            if scenes.get(key) != expected.get(key):
+                differing.append(f"{key.task} {key.episode}")
+        require(
+            not differing,
+            f"{training.folder} and {trainings[0].folder} have different scenes or step limits:"
+            f" {listed(differing)}. Rows of one board have the same.",
+        )
     return rows
 
 
@@ -164,7 +163,9 @@ def _places(folders: Iterable[Path]) -> list[Path]:
             f"rows={folder}: there is no such folder. Name one that holds <row>/<training seed>.",
         )
         names = (RUN_FILE, TRAINED, "episodes*.jsonl", "episodes*.jsonl.xz")
-        below = {path.parent for name in names for path in folder.rglob(name)}
+        below: set[Path] = set()
+        for name in names:
+            below.update(path.parent for path in folder.rglob(name))
         require(
             below, f"rows={folder} holds no row: no {TRAINED}, {RUN_FILE} or {RECORDS} below it."
         )
@@ -191,7 +192,10 @@ def read_training(folder: Path) -> Training:
         config = yaml.safe_load(read_text(folder / CONFIG, "a composed configuration"))
     except yaml.YAMLError as error:
         raise UserError(f"{folder / CONFIG} is not YAML: {error}.") from None
-    records = _ended([record for file in find_records([folder]) for record in read_records(file)])
+    every: list[EpisodeRecord] = []
+    for file in find_records([folder]):
+        every += read_records(file)
+    records = _ended(every)
     require(records, f"{folder} lacks {RECORDS}, or it has no episode.")
     _check_identity(folder, facts, run["settings"], config or {}, records)
     counts = Counter(record.key for record in records)
@@ -208,15 +212,19 @@ def _ended(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
     """The records without the errors of episodes that were repeated, of which the last stays where
     all are errors.
     """
-    newest_errors = {record.key: record for record in records if record.outcome == "error"}
+    newest_errors: dict[EpisodeKey, EpisodeRecord] = {}
+    without_error: set[EpisodeKey] = set()
     for record in records:
-        if record.outcome != "error":
-            newest_errors.pop(record.key, None)
-    return [
-        record
-        for record in records
-        if record.outcome != "error" or record is newest_errors.get(record.key)
-    ]
+        if record.outcome == "error":
+            newest_errors[record.key] = record
+        else:
+            without_error.add(record.key)
+    ended = []
+    for record in records:
+        is_newest_error = record is newest_errors.get(record.key)
+        if record.outcome != "error" or (is_newest_error and record.key not in without_error):
+            ended.append(record)
+    return ended
 
 
 def _check_identity(
@@ -227,12 +235,10 @@ def _check_identity(
     records: Sequence[EpisodeRecord],
 ) -> None:
     """Make sure that the four files are of one training."""
-    fields = [
-        (key, field)
-        for key, field in _SETTINGS.items()
-        if facts.trained or key in ("model", "split")
-    ]
-    expected = {"training": facts.identity, **{field: settings.get(key) for key, field in fields}}
+    expected: dict[str, Any] = {"training": facts.identity}
+    for key, field in _SETTINGS.items():
+        if facts.trained or key in ("model", "split"):
+            expected[field] = settings.get(key)
     if any(record.composition for record in records):
         expected["composition"] = composition_digest(config)
     source = {"training": TRAINED, "composition": CONFIG}

@@ -83,9 +83,9 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
     with minutes.of("evaluation"):
         records = evaluate_all(nano, results, jobs, files, rows.robot)
     if nano.shard is not None or len(choose_tasks(nano.task)) > 1:
-        for row, of_row in records.items():
-            n_successes = sum(record.success for record in of_row)
-            logger.info("%s: %d of %d episodes", row, n_successes, len(of_row))
+        for row, row_records in records.items():
+            n_successes = sum(record.success for record in row_records)
+            logger.info("%s: %d of %d episodes", row, n_successes, len(row_records))
         return results
     videos: list[Path] = []
     with minutes.of("videos"):
@@ -93,7 +93,9 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
             row, (first, *others) = next(iter(jobs.items()))
             of_first = records[row][: len(records[row]) // (1 + len(others))]
             videos = record_videos(first.checkpoint, folder / "videos", of_first, rules_of(nano))
-    trained = {row: [job.folder for job in of_row] for row, of_row in jobs.items()}
+    trained = {}
+    for row, of_row in jobs.items():
+        trained[row] = [job.folder for job in of_row]
     page = write_page(folder, nano, records, rows.blind, minutes.spent, videos, trained, len(files))
     print(page)
     for line in outcome_lines(records, ends_of(trained)):
@@ -150,8 +152,10 @@ def compose_rows(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Rows:
         vision = each["backbone"].get("vision")
         layout = vision.get("layout") if isinstance(vision, Mapping) else None
         check_reflection(nano.learning["reflect"], robot.action, layout)
-    memories = [each["memory"] for each in (*composed.values(), *others) if each["memory"]]
-    choices = [FrameChoice(DECISIONS, memory, robot.action.execute) for memory in [None, *memories]]
+    choices = [FrameChoice(DECISIONS, None, robot.action.execute)]
+    for each in (*composed.values(), *others):
+        if each["memory"]:
+            choices.append(FrameChoice(DECISIONS, each["memory"], robot.action.execute))
     blind = None
     for row, each in composed.items():
         if blind is None and each["memory"] is None and not each["subgoal_text"]:
@@ -204,22 +208,31 @@ def evaluate_all(
     records: dict[str, list[EpisodeRecord]] = {}
     for row, of_row in jobs.items():
         selected = further if nano.is_further(row) else specs
+        names = [row]
         model, at, budget = row.partition("@")
-        oracle = f"{ORACLE_FRAMES}{at}{budget}" if model == nano.oracle else None
-        for name in [row] if oracle is None else [row, oracle]:
+        if model == nano.oracle:
+            names.append(f"{ORACLE_FRAMES}{at}{budget}")
+        for name in names:
+            ceiling = None if name == row else name
             records[name] = []
             for job in of_row:
                 place = folder / name / str(job.seed)
-                ceiling = None if name == row else oracle
                 records[name] += evaluate_row(
                     job.folder, job.checkpoint, place, selected, rules, ceiling
                 )
-    if nano.shard is None:
-        by_choice = bool(robot.action.choice)
-        moves = frequent_moves(files, robot.action) if by_choice else {}
-        ceilings = [DEMONSTRATOR if by_choice else PLANNER] if nano.planner else []
-        for name in ceilings + ([RANDOM, FREQUENT] if nano.floors else []):
-            records[name] = play_all(name, folder / name / "0", specs, rules, moves)
+    if nano.shard is not None:
+        return records
+
+    # The rows that nothing was trained for
+    by_choice = bool(robot.action.choice)
+    untrained = []
+    if nano.planner:
+        untrained.append(DEMONSTRATOR if by_choice else PLANNER)
+    if nano.floors:
+        untrained += [RANDOM, FREQUENT]
+    moves = frequent_moves(files, robot.action) if by_choice else {}
+    for name in untrained:
+        records[name] = play_all(name, folder / name / "0", specs, rules, moves)
     return records
 
 
@@ -266,15 +279,12 @@ def counts_of(
     counts: dict[tuple[str, str], int] = {}
     for name in choose_tasks(task):
         amounts = {**demonstrations, **(others or {}).get(name, {})}
-        fits = set(amounts) <= set(DIFFICULTIES) and all(
-            isinstance(n, int) and n >= 0 for n in amounts.values()
-        )
-        require(
-            fits,
-            f"demonstrations={brief(amounts)}: write how many of each difficulty"
-            f" ({', '.join(DIFFICULTIES)}), such as {{easy: 100}}.",
-        )
         for level, amount in amounts.items():
+            require(
+                level in DIFFICULTIES and isinstance(amount, int) and amount >= 0,
+                f"demonstrations={brief(amounts)}: write how many of each difficulty"
+                f" ({', '.join(DIFFICULTIES)}), such as {{easy: 100}}.",
+            )
             counts[name, level] = amount
     require(
         sum(counts.values()) >= 2,
@@ -349,12 +359,13 @@ class Group:
 
     def take(self, tried: Sequence[Scene]) -> None:
         """Note what came of them."""
-        new = [scene.path for scene in tried if scene.made]
+        n_before = len(self.files)
         for scene in tried:
-            if not scene.made:
+            if scene.made:
+                self.files.append(scene.path)
+            else:
                 logger.info("left out: %s, seed %d, %s", scene.task, scene.seed, scene.difficulty)
-        self.files += new
-        self.failed = 0 if new else self.failed + len(tried)
+        self.failed = self.failed + len(tried) if len(self.files) == n_before else 0
         if self.failed >= RETRIES:
             last = tried[-1]
             raise UserError(
@@ -371,15 +382,25 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
     with progress("record", total, unit="demonstrations") as advance:
         while lacking := [group for group in groups if len(group.files) < group.required]:
             tried = [group.next() for group in lacking]
+            missing = []
+            n_made = 0
             # In turn, so that an interrupted run has some of every group.
-            alternating = [scene for scene in chain(*zip_longest(*tried)) if scene is not None]
-            missing = [scene for scene in alternating if not scene.tried]
-            advance(sum(scene.made for scene in alternating if scene.tried))
+            for scene in chain(*zip_longest(*tried)):
+                if scene is None:
+                    continue
+                if scene.tried:
+                    n_made += scene.made
+                else:
+                    missing.append(scene)
+            advance(n_made)
             for made in carry_out(missing, demonstrated, workers):
                 advance(int(made))
             for group, scenes in zip(lacking, tried, strict=True):
                 group.take(scenes)
-    return [file for group in groups for file in group.files]
+    files: list[Path] = []
+    for group in groups:
+        files += group.files
+    return files
 
 
 class Minutes:

@@ -50,9 +50,8 @@ IN_HAND, GRASP = 0.03, (0.004, 0.03)
 """Metres from the tool's centre to a held object's, and between which a finger is then."""
 UNDER_MARK = 0.01  # metres between a disc and the mark that covers it, at most
 FIRST_STEP = 3  # of a state, at which it is rendered; then at twice the step before
-STATES = frozenset(
-    name for name in CLASSES if name.startswith(("pressed", "mark", "highlight")) or "held" in name
-)
+_OF_A_STATE = ("pressed", "mark", "highlight", "held", "other held")
+STATES = frozenset(name for name in CLASSES if name.startswith(_OF_A_STATE))
 
 
 class Place(NamedTuple):
@@ -67,25 +66,28 @@ class Place(NamedTuple):
 
 def find_places(env: "Task") -> list[Place]:
     """The class and the place of everything in a scene, visible or not."""
-    return [
-        Place(CLASSES.index(name), np.asarray(centre, np.float64), ids)
-        for name, centre, ids in _named_places(env)
-    ]
+    places = []
+    for name, centre, ids in _named_places(env):
+        places.append(Place(CLASSES.index(name), np.asarray(centre, np.float64), ids))
+    return places
 
 
 def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
     yield "hand", env.tcp_pose.p, [int(link.per_scene_id[0]) for link in env.agent.robot.links]
     lit = list(_lit_discs(env))
+    lit_discs = [disc for _, disc in lit]
+    is_grasping = GRASP[0] < float(env.fingers.mean()) < GRASP[1]
     for thing in env.things:
         name = _class_of(thing)
         parts = (thing.head, thing.tail) if isinstance(thing, Peg) else (thing,)
         for part in parts:
             position = part.position
-            ids = _visible_ids(part, [disc for _, disc in lit])
+            ids = _visible_ids(part, lit_discs)
             yield name, position, ids
             if isinstance(thing, Button) and pressed(thing):
                 yield "pressed button", position, ids
-            if _in_gripper(env, name, position):
+            is_near = float(np.linalg.norm(position - env.tcp_pose.p)) < IN_HAND
+            if is_grasping and is_near and name.endswith(("cube", "container", "peg end")):
                 class_name = f"held {name}"
                 if class_name not in CLASSES:
                     class_name = "other held object"
@@ -133,27 +135,17 @@ def _lit_discs(env: "Task") -> Iterator[tuple[str, Any]]:
                 yield kind, disc
 
 
-def _in_gripper(env: "Task", name: str, centre: np.ndarray) -> bool:
-    finger = float(env.fingers.mean())
-    near = float(np.linalg.norm(centre - env.tcp_pose.p)) < IN_HAND
-    return name.endswith(("cube", "container", "peg end")) and near and GRASP[0] < finger < GRASP[1]
-
-
 def visible_places(places: Sequence[Place], segmentation: np.ndarray) -> np.ndarray:
     """The places [m, 4] (class, x, y, z) whose objects show enough pixels in an image that holds
     their centre.
     """
-    counts = np.bincount(
-        segmentation.ravel(), minlength=1 + max(max(place.ids) for place in places)
-    )
+    largest_id = max(max(place.ids) for place in places)
+    counts = np.bincount(segmentation.ravel(), minlength=1 + largest_id)
     rows = []
     for number, centre, ids in places:
         pixel = project(centre)
-        if (
-            counts[list(set(ids))].sum() >= VISIBLE_PIXELS
-            and (pixel >= 0).all()
-            and (pixel < SIDE).all()
-        ):
+        is_inside = (pixel >= 0).all() and (pixel < SIDE).all()
+        if is_inside and counts[list(set(ids))].sum() >= VISIBLE_PIXELS:
             rows.append([number, *centre])
     return np.array(rows, np.float32).reshape(-1, 4)
 
@@ -208,7 +200,8 @@ def record_scene(
         ).record()
         if arrangements:
             env.reset()
-        arm, rng = Arm(env.agent), np.random.default_rng(seed)
+        arm = Arm(env.agent)
+        rng = np.random.default_rng(seed)
         for _ in range(arrangements):
             _arrange(env, arm, rng)
             renders.take()
@@ -254,7 +247,8 @@ def _relocate(thing: Any, rng: np.random.Generator) -> None:
     """Turned and, three times of ten, where it was; now and then lifted; containers out of the way
     half of the time.
     """
-    name, home = _class_of(thing), thing.initial_pose
+    name = _class_of(thing)
+    home = thing.initial_pose
     if name == "container" and rng.random() < 0.5:
         return thing.move_away()
     if rng.random() < 0.3:

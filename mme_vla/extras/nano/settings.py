@@ -78,22 +78,17 @@ class NanoRun:
         """Read a composed configuration, plain and resolved."""
         run = read_section(cls, config, others=True, config={})
         read_section(LearningSettings, config["learning"], "learning")
-        run._check_episodes()
-        return replace(run, train=config["train"], learning=config["learning"], config=config)
-
-    def _check_episodes(self) -> None:
-        """Make sure that the episodes exist: they are chosen only after hours of recording and
-        training.
-        """
-        amounts = [self.episodes]
-        if self.also and self.also_episodes is not None:
-            amounts.append(self.also_episodes)
+        # Episodes are chosen after hours of recording and training: make sure now that they exist.
+        amounts = [run.episodes]
+        if run.also and run.also_episodes is not None:
+            amounts.append(run.also_episodes)
         for episodes in amounts:
             require(
-                isinstance(episodes, int) or not self.replace,
+                isinstance(episodes, int) or not run.replace,
                 f"episodes={episodes}: with replace=true write how many scenes of each task.",
             )
-            choose_episodes(self.task, episodes, self.split)
+            choose_episodes(run.task, episodes, run.split)
+        return replace(run, train=config["train"], learning=config["learning"], config=config)
 
     @property
     def budgets(self) -> tuple[int | None, ...]:

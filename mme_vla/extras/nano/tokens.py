@@ -46,7 +46,8 @@ class FrameTokens:
 
     def at(self, camera: str, frames: Sequence[int] | np.ndarray) -> Tensor:
         """The tokens [n, patches, d] of these frames."""
-        known, numbers = self.frames[camera], np.asarray(frames, np.int64)
+        known = self.frames[camera]
+        numbers = np.asarray(frames, np.int64)
         missing = sorted(set(numbers.tolist()) - set(known.tolist()))
         require(
             not missing,
@@ -60,22 +61,18 @@ class FrameTokens:
         """
         from safetensors.torch import save_file
 
-        tensors = {f"tokens/{name}": value for name, value in self.tokens.items()}
-        tensors |= {
-            f"frames/{name}": torch.from_numpy(value) for name, value in self.frames.items()
-        }
+        tensors: dict[str, Tensor] = {}
+        for name, tokens in self.tokens.items():
+            tensors[f"tokens/{name}"] = tokens
+        for name, frames in self.frames.items():
+            tensors[f"frames/{name}"] = torch.from_numpy(frames)
         for key, rows in self.scores.items():
-            tensors |= {
-                f"scored/{key}": torch.from_numpy(rows.frames),
-                f"scores/{key}": torch.from_numpy(rows.values),
-            }
+            tensors[f"scored/{key}"] = torch.from_numpy(rows.frames)
+            tensors[f"scores/{key}"] = torch.from_numpy(rows.values)
+        contiguous = {name: value.contiguous() for name, value in tensors.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as draft:
-            save_file(
-                {name: value.contiguous() for name, value in tensors.items()},
-                draft,
-                {"stamp": stamp},
-            )
+            save_file(contiguous, draft, {"stamp": stamp})
 
     @classmethod
     def load(cls, path: Path) -> "FrameTokens":
@@ -91,15 +88,11 @@ class FrameTokens:
         for name, value in load_file(path).items():
             part, _, key = name.partition("/")
             parts[part][key] = value
-        scores = {
-            key: FrameScores(parts["scored"][key].numpy(), rows.numpy())
-            for key, rows in parts["scores"].items()
-        }
-        return cls(
-            {name: value.numpy() for name, value in parts["frames"].items()},
-            parts["tokens"],
-            scores,
-        )
+        frames = {name: value.numpy() for name, value in parts["frames"].items()}
+        scores = {}
+        for key, values in parts["scores"].items():
+            scores[key] = FrameScores(parts["scored"][key].numpy(), values.numpy())
+        return cls(frames, parts["tokens"], scores)
 
 
 @torch.no_grad()
@@ -119,18 +112,16 @@ def tokenize(
         frames[camera] = np.array(sorted(taken), np.int64)
         parts = []
         for some in np.array_split(frames[camera], -(-len(frames[camera]) // 32)):
-            views = processor.images(
-                [np.stack([taken[int(k)] for k in some])] * len(policy.embodiment.camera_names)
-            )
+            images = np.stack([taken[frame] for frame in some.tolist()])
+            views = processor.images([images] * len(policy.embodiment.camera_names))
             parts.append(policy.backbone.encode_images(views[:, 0].float() / 255 * 2 - 1).half())
         tokens[camera] = torch.cat(parts)
     readers = [*memories] if policy.memory is None else [policy.memory, *memories]
-    images = demonstration.images.get(policy.embodiment.memory_camera, {})
-    scores = {
-        memory.storage.scorer: _scores(memory, images)
-        for memory in readers
-        if memory.storage.scorer
-    }
+    memory_images = demonstration.images.get(policy.embodiment.memory_camera, {})
+    scores = {}
+    for memory in readers:
+        if memory.storage.scorer:
+            scores[memory.storage.scorer] = _scores(memory, memory_images)
     return FrameTokens(frames, tokens, scores)
 
 
@@ -138,9 +129,13 @@ def _scores(memory: "Memory", images: Mapping[int, np.ndarray]) -> FrameScores:
     """The scores of these frames by the memory's scorer, as in an episode."""
     scorer = memory.make_scorer()
     assert scorer is not None
-    read = scorer.frames_scored(max(images) + 1).tolist()
-    scored_rows = {frame: scorer(frame, images[frame]) for frame in read if frame in images}
-    rows = {frame: values for frame, values in scored_rows.items() if values is not None}
+    rows: dict[int, np.ndarray] = {}
+    for frame in scorer.frames_scored(max(images) + 1).tolist():
+        if frame not in images:
+            continue
+        values = scorer(frame, images[frame])
+        if values is not None:
+            rows[frame] = values
     if not rows:
         return FrameScores.empty(memory.storage.grid**2)
     return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
@@ -148,12 +143,13 @@ def _scores(memory: "Memory", images: Mapping[int, np.ndarray]) -> FrameScores:
 
 def stamp_of(file: Path) -> str:
     """Twelve letters that name a demonstration's content and which of its frames are rendered."""
+    content = hashlib.sha256()
     with np.load(file) as stored:
-        names = [name for name in stored if not name.endswith("_pictures")]
-        parts = b"".join(
-            name.encode() + np.ascontiguousarray(stored[name]).tobytes() for name in names
-        )
-    return hashlib.sha256(parts).hexdigest()[:12]
+        for name in stored:
+            if not name.endswith("_pictures"):
+                content.update(name.encode())
+                content.update(np.ascontiguousarray(stored[name]).tobytes())
+    return content.hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -173,12 +169,14 @@ class TokenStore:
     @classmethod
     def of(cls, folder: Path, configs: Sequence[Mapping[str, Any]]) -> "TokenStore":
         """The store of rows that share a tower: their composed configurations."""
-        sections = set()
+        scored = set()
         for config in configs:
-            if memory := PolicySections.of(config).memory:
-                sections.add(json.dumps(memory, sort_keys=True))
-        scored = sorted(text for text in sections if _memory(text).storage.scorer)
-        return cls(json.dumps(dict(configs[0])), folder, tuple(scored))
+            memory = PolicySections.of(config).memory
+            if memory:
+                section = json.dumps(memory, sort_keys=True)
+                if _memory(section).storage.scorer:
+                    scored.add(section)
+        return cls(json.dumps(dict(configs[0])), folder, tuple(sorted(scored)))
 
     @property
     def tower(self) -> str:

@@ -125,7 +125,8 @@ class Residual(nn.Module):
 
 def build_stages(widths: Sequence[int], blocks: Sequence[int]) -> list[list[nn.Module]]:
     """The layers of each stage, the first on images: a strided convolution and residual blocks."""
-    stages, before = [], 3
+    stages = []
+    before = 3  # channels of an image
     for width, count, stride in zip(widths, blocks, STRIDES, strict=True):
         kernel = stride + 2 * (stride // 2)  # windows overlap: places know what is at their borders
         down = nn.Conv2d(before, width, kernel, stride, padding=(kernel - stride) // 2)
@@ -161,9 +162,9 @@ class PlaceTower(nn.Module):
 
     def __init__(self, widths: Sequence[int], blocks: Sequence[int]) -> None:
         super().__init__()
-        self.stages = nn.ModuleList(
-            nn.Sequential(*layers) for layers in build_stages(widths, blocks)
-        )
+        self.stages = nn.ModuleList()
+        for layers in build_stages(widths, blocks):
+            self.stages.append(nn.Sequential(*layers))
         fine = widths[0]
         self.laterals = nn.ModuleList(nn.Conv2d(width, fine, 1) for width in widths)
         self.join = Residual(fine)
@@ -183,7 +184,8 @@ class PlaceTower(nn.Module):
         """
         side = images.shape[-1]
         # whole tokens, and at least one row of them
-        features, x = [], images[..., : max(1, round(side * IN_USE / 16)) * 16, :]
+        x = images[..., : max(1, round(side * IN_USE / 16)) * 16, :]
+        features = []
         for stage in self.stages:
             x = stage(x)
             features.append(x)
@@ -214,13 +216,11 @@ def summarise(presence: Tensor, offsets: Tensor) -> Tensor:
     counted = (presence - FLOOR).clamp(min=0) / (1 - FLOOR)
     mass = counted / CELLS_PER_OBJECT
     share = mass / (mass.sum((-2, -1), keepdim=True) + FAINT)
-    orders = (
-        torch.arange(WAVES, device=presence.device, dtype=presence.dtype)[:, None, None] * math.pi
-    )
+    orders = torch.arange(WAVES, device=presence.device, dtype=presence.dtype) * math.pi
+    orders = orders[:, None, None]
     # K waves of each order over cells, and their products summed up over the cells of each token
-    across, along = (
-        (orders * (place[:, :, None].clamp(-1, 1) + 1) / 2).cos() for place in (column, row)
-    )
+    across = (orders * (column[:, :, None].clamp(-1, 1) + 1) / 2).cos()
+    along = (orders * (row[:, :, None].clamp(-1, 1) + 1) / 2).cos()
     across, along = _by_token(mass[:, :, None] * across), _by_token(along)
     waves = (across @ along.transpose(-2, -1)).permute(0, 1, 4, 5, 2, 3).flatten(1, 3)
     summed = torch.cat([share, share * column, share * row], 1)
@@ -260,14 +260,13 @@ def reflect(tokens: Tensor, signs: Tensor, exchange: Tensor) -> Tensor:
         signs: of columns and rows, 1 or −1, [b, 2].
         exchange: whether column and row then change places, [b] bool.
     """
-    count, ones = 4 * len(CLASSES), [1] * (tokens.ndim - 2)
+    count = 4 * len(CLASSES)
+    ones = [1] * (tokens.ndim - 2)
     presence, share, column, row = tokens[..., :count].chunk(4, -1)
-    across, along = (sign.view(-1, *ones, 1) for sign in signs.unbind(-1))
+    column = column * signs[:, 0].view(-1, *ones, 1)
+    row = row * signs[:, 1].view(-1, *ones, 1)
     swapped = exchange.view(-1, *ones, 1)
-    column, row = (
-        torch.where(swapped, row * along, column * across),
-        torch.where(swapped, column * across, row * along),
-    )
+    column, row = torch.where(swapped, row, column), torch.where(swapped, column, row)
     # A cosine of odd order changes its sign where its place does.
     odd = torch.arange(WAVES, device=tokens.device) % 2 == 1
     signed = torch.where(odd, signs[..., None], 1).to(tokens.dtype)  # b 2 i
@@ -283,17 +282,14 @@ def reflect_points(points: Tensor, signs: Tensor, exchange: Tensor) -> Tensor:
     """
     ones = [1] * (points.ndim - 2)
     row, column = points.unbind(-1)
-    column, row = (
-        within(column, COLUMNS) * signs[:, 0].view(-1, *ones),
-        within(row, ROWS) * signs[:, 1].view(-1, *ones),
-    )
+    column = within(column, COLUMNS) * signs[:, 0].view(-1, *ones)
+    row = within(row, ROWS) * signs[:, 1].view(-1, *ones)
     swapped = exchange.view(-1, *ones)
     column, row = torch.where(swapped, row, column), torch.where(swapped, column, row)
-    sides = [
-        (place * (high - low) / 2 + (low + high) / 2 + 1) / 2
-        for place, (low, high) in ((row, ROWS), (column, COLUMNS))
-    ]
-    return torch.stack(sides, -1)
+    shares = []
+    for place, (low, high) in ((row, ROWS), (column, COLUMNS)):  # back from `within`
+        shares.append((place * (high - low) / 2 + (low + high) / 2 + 1) / 2)
+    return torch.stack(shares, -1)
 
 
 def place_waves(where: Tensor) -> Tensor:
@@ -330,14 +326,12 @@ def load_shipped(tower: nn.Module, layout: str) -> None:
         "vision.layout=segments is of checkpoints that bring their weights: none ship with the"
         " library. Use vision.layout=places, or vision.pretrained=false.",
     )
-    state = {
-        name: value.float()
-        for name, value in load(files("mme_vla").joinpath(WEIGHTS).read_bytes()).items()
-    }
-    expected = tower.state_dict()
+    stored = load(files("mme_vla").joinpath(WEIGHTS).read_bytes())
+    state = {name: value.float() for name, value in stored.items()}
+    shapes = {name: value.shape for name, value in stored.items()}
+    required = {name: value.shape for name, value in tower.state_dict().items()}
     require(
-        {name: value.shape for name, value in state.items()}
-        == {name: value.shape for name, value in expected.items()},
+        shapes == required,
         "The vision weights that ship with the library are for the sizes of backbone=nano. With"
         " others set backbone.vision.pretrained=false, or train a tower of that size: mme-vla"
         " vision-pretrain.",

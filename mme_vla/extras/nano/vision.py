@@ -4,6 +4,7 @@ shows. New policies have `tower.PlaceTower`.
 
 import math
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
@@ -54,9 +55,7 @@ class ConvTower(nn.Module):
 
     def __init__(self, widths: Sequence[int], blocks: Sequence[int], out: int) -> None:
         super().__init__()
-        self.stages = nn.Sequential(
-            *(layer for stage in build_stages(widths, blocks) for layer in stage)
-        )
+        self.stages = nn.Sequential(*chain.from_iterable(build_stages(widths, blocks)))
         before = widths[-1]
         self.norm = nn.GroupNorm(8, before)
         self.out = nn.Conv2d(before, out, 1)
@@ -87,8 +86,9 @@ class ConvTower(nn.Module):
         grid = math.isqrt(shares.shape[1])
         middles = (torch.arange(grid, device=shares.device) + 0.5) / grid * 2 - 1
         line = (torch.arange(FINE, device=shares.device) + 0.5) / FINE * 2 - 1
-        lines = line.repeat(FINE), line.repeat_interleave(FINE)
-        column, row = ((shares * line).mean(-1) / mass / grid for line in lines)
+        # The place of a class in its token, then in the image
+        column = (shares * line.repeat(FINE)).mean(-1) / mass / grid
+        row = (shares * line.repeat_interleave(FINE)).mean(-1) / mass / grid
         column = share * (column + middles.repeat(grid)[:, None])
         row = share * (row + middles.repeat_interleave(grid)[:, None])
         parts = (presence, share, column, row, colours)

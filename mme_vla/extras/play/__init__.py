@@ -37,21 +37,15 @@ __all__ = [
 ]
 
 _HOMES = {
-    name: f"mme_vla.{module}"
-    for module, names in {
-        "embodiment.action_space": ["Option"],
-        "extras.play.game": ["ChoiceSession", "Decision", "Reveal"],
-        "extras.play.players": [
-            "PLAYERS",
-            "NoChoiceError",
-            "OraclePlayer",
-            "Player",
-            "RandomPlayer",
-            "build_player",
-        ],
-        "extras.play.vlm_players": ["GeminiPlayer", "OpenAIPlayer", "QwenPlayer"],
-    }.items()
-    for name in names
+    "Option": "mme_vla.embodiment.action_space",
+    **dict.fromkeys(("ChoiceSession", "Decision", "Reveal"), "mme_vla.extras.play.game"),
+    **dict.fromkeys(
+        ("PLAYERS", "NoChoiceError", "OraclePlayer", "Player", "RandomPlayer", "build_player"),
+        "mme_vla.extras.play.players",
+    ),
+    **dict.fromkeys(
+        ("GeminiPlayer", "OpenAIPlayer", "QwenPlayer"), "mme_vla.extras.play.vlm_players"
+    ),
 }
 
 

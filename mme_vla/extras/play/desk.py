@@ -132,15 +132,12 @@ class Desk:
             "session": session_id,
         }
         if phase == "finished":
-            state["summary"] = [
-                {
-                    "task": task,
-                    "successes": successes,
-                    "episodes": count,
-                    "human": paper.get("Human"),
-                }
-                for task, successes, count, paper in run.summary()
-            ]
+            state["summary"] = []
+            for task, successes, count, paper in run.summary():
+                human = paper.get("Human")
+                state["summary"].append(
+                    {"task": task, "successes": successes, "episodes": count, "human": human}
+                )
         which = None
         if session is not None:
             which = session.episode
@@ -150,6 +147,9 @@ class Desk:
             state |= {"task": which.task, "split": which.split, "episode": which.episode}
         if session is not None and session.reveals:
             reveals, decisions = list(session.reveals), list(session.decisions)
+            options = []
+            for option in session.options:
+                options.append({**vars(option), "objects": self._objects.get(option.label)})
             state |= {
                 "goal": session.goal,
                 "status": session.status,
@@ -157,10 +157,7 @@ class Desk:
                 "problem": session.error,
                 "ended_by": session.ended_by,
                 "max_choices": session.max_choices,
-                "options": [
-                    {**vars(option), "objects": self._objects.get(option.label)}
-                    for option in session.options
-                ],
+                "options": options,
                 "reach": REACH,
                 "reveals": [
                     {"title": r.title, "start": r.start, "count": len(r.frames)} for r in reveals

@@ -94,10 +94,15 @@ class ChoiceSession:
         clock: Callable[[], float] = time.perf_counter,
         max_steps: int | None = None,
     ) -> None:
-        self.env, self.episode, self.max_choices, self.images = env, episode, max_choices, images
+        self.env = env
+        self.episode = episode
+        self.max_choices = max_choices
+        self.images = images
         self._max_steps = max_steps
         self._motionless = 0  # choices that moved nothing
-        self.goal, self.status, self.error = "", "not started", ""
+        self.goal = ""
+        self.status = "not started"
+        self.error = ""
         self.ended_by = ""
         """What ended the episode where it was not the environment: `max_choices`, `max_steps`, or a
         player's reason.
@@ -108,7 +113,8 @@ class ChoiceSession:
         """What the environment returned last, for players that read more than images."""
         self.reveals: list[Reveal] = []
         self.decisions: list[Decision] = []
-        self._clock, self._displayed_at = clock, 0.0
+        self._clock = clock
+        self._displayed_at = 0.0
         self._begun = clock()
         self._simulated = self._policy_seconds = 0.0
 
@@ -168,8 +174,12 @@ class ChoiceSession:
                 dict(note or {}),
             )
         )
-        if not self.over:
-            self._end_at_limits()
+        if self.over:
+            return self.reveals[-1]
+        if self.max_choices is not None and len(self.decisions) >= self.max_choices:
+            self.give_up("timeout", "max_choices")
+        elif self._max_steps is not None and self.steps + self._motionless > self._max_steps:
+            self.give_up("timeout", "max_steps")
         return self.reveals[-1]
 
     def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
@@ -200,12 +210,6 @@ class ChoiceSession:
         self.status, self.ended_by = outcome, reason
         if outcome == "error":
             self.error = reason
-
-    def _end_at_limits(self) -> None:
-        if self.max_choices is not None and len(self.decisions) >= self.max_choices:
-            self.give_up("timeout", "max_choices")
-        elif self._max_steps is not None and self.steps + self._motionless > self._max_steps:
-            self.give_up("timeout", "max_steps")
 
     # What there is to see -------------------------------------------------------------------------
 
@@ -283,9 +287,9 @@ class ChoiceSession:
             return pixels
         for choice in task.choices():
             if choice.candidates is not None:
-                pixels[choice.label] = [
-                    tuple(project(thing.position).tolist()) for thing in choice.candidates
-                ]
+                pixels[choice.label] = []
+                for thing in choice.candidates:
+                    pixels[choice.label].append(tuple(project(thing.position).tolist()))
         return pixels
 
     def close(self) -> None:
@@ -306,15 +310,13 @@ class ChoiceSession:
             goal = info["task_goal"]
             self.goal = goal if isinstance(goal, str) else str(goal[0])
         if "available_multi_choices" in info:
-            self.options = tuple(
-                Option(
-                    str(option["label"]).lower(),
-                    str(option["action"]),
-                    bool(option["need_parameter"]),
-                )
-                for option in info["available_multi_choices"]
-                if option.get("possible", True)
-            )
+            options = []
+            for option in info["available_multi_choices"]:
+                if option.get("possible", True):
+                    label = str(option["label"]).lower()
+                    needs_point = bool(option["need_parameter"])
+                    options.append(Option(label, str(option["action"]), needs_point))
+            self.options = tuple(options)
         self._displayed_at = self._clock()
 
 

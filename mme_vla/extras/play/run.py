@@ -88,14 +88,13 @@ class PlayRun:
         self.episodes = list(episodes)
         keys = {(which.task, which.episode) for which in self.episodes}
         # Folders below hold runs of their own.
-        there = [
-            record
-            for path in sorted(folder.glob("episodes*.jsonl"))
-            for record in read_records(path)
-        ]
-        self.records = [
-            record for record in merge(there, "last") if (record.task, record.episode) in keys
-        ]
+        there: list[EpisodeRecord] = []
+        for path in sorted(folder.glob("episodes*.jsonl")):
+            there += read_records(path)
+        self.records = []
+        for record in merge(there, "last"):
+            if (record.task, record.episode) in keys:
+                self.records.append(record)
         done = finished(self.records, retry_errors)
         self.todo = [which for which in self.episodes if (which.task, which.episode) not in done]
 

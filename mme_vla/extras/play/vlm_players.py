@@ -4,6 +4,7 @@ import math
 import re
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -37,21 +38,20 @@ Leave "point" as null for options without [point]."""  # noqa: E501
 
 def option_list(options: Sequence[Option]) -> str:
     """`a: pick up the cube [point]`, one a line."""
-    return "\n".join(
-        f"{option.label}: {option.action}{' [point]' if option.needs_point else ''}"
-        for option in options
-    )
+    lines = []
+    for option in options:
+        mark = " [point]" if option.needs_point else ""
+        lines.append(f"{option.label}: {option.action}{mark}")
+    return "\n".join(lines)
 
 
 def choice_text(decision: Decision) -> str:
     """A past decision in words: `a: pick up the cube at [442, 617]`."""
-    point = decision.point
-    place = (
-        ""
-        if point is None
-        else " at [{}, {}]".format(*(to_thousandths(int(value)) for value in point))
-    )
-    return f"{decision.choice}: {decision.action}{place}"
+    text = f"{decision.choice}: {decision.action}"
+    if decision.point is not None:
+        row, column = decision.point
+        text += f" at [{to_thousandths(int(row))}, {to_thousandths(int(column))}]"
+    return text
 
 
 def full_question(
@@ -64,7 +64,8 @@ def full_question(
     complaint: why the last reply to the same question could not be used; empty the first time.
     """
     lines = [f"The task: {goal}"]
-    lines += [f"{title}: {VIDEO if frames else 'nothing moved.'}" for title, frames in clips]
+    for title, has_frames in clips:
+        lines.append(f"{title}: {VIDEO if has_frames else 'nothing moved.'}")
     lines += [f"The present image: {IMAGE}", "Options:", option_list(options)]
     if complaint:
         lines.append(complaint)
@@ -74,21 +75,17 @@ def full_question(
 
 def opening(goal: str, options: Sequence[Option], video: bool) -> str:
     """The first question of a conversation."""
-    introduction = (
-        "The video comes before you act; the image is the present one."
-        if video
-        else "This is the present image."
-    )
+    introduction = "This is the present image."
+    if video:
+        introduction = "The video comes before you act; the image is the present one."
     return f"The task: {goal}\n{introduction}\nOptions:\n{option_list(options)}\nWhat next?"
 
 
 def following(decision: Decision, options: Sequence[Option], changed: bool) -> str:
     """A later question of a conversation."""
-    description = (
-        "the video shows it, the image is the present one"
-        if changed
-        else "nothing moved; this is the present image"
-    )
+    description = "nothing moved; this is the present image"
+    if changed:
+        description = "the video shows it, the image is the present one"
     return (
         f"You chose {choice_text(decision)}; {description}.\nOptions:\n{option_list(options)}\nWhat"
         " next?"
@@ -112,7 +109,12 @@ def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
     Raises:
         MalformedReply: no object, an unknown option, or a point that is missing or none.
     """
-    fields = next(filter(None, map(_parsed, reversed(_OBJECT.findall(reply)))), {})
+    fields: dict[str, Any] = {}
+    for text in reversed(_OBJECT.findall(reply)):
+        with suppress(UserError):
+            fields = parse_json(text, "the answer", finite=False)
+        if fields:
+            break
     letter = fields.get("choice")
     label = letter.strip().strip("().:[]").lower() if isinstance(letter, str) else None
     option = next((option for option in options if option.label == label), None)
@@ -137,24 +139,14 @@ def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
 def _misfit(point: Any, option: Option) -> str | None:
     if not isinstance(point, list) or len(point) != 2:
         return f'option {option.label} needs "point": [row, column]'
-    if any(
-        isinstance(v, bool) or not isinstance(v, int | float) or v != v or abs(v) == math.inf
-        for v in point
-    ):
-        return "a point is made of two numbers"
-    return (
-        None
-        if all(0 <= value <= THOUSAND for value in point)
-        else f"a point lies within 0 and {THOUSAND}"
-    )
-
-
-def _parsed(text: str) -> dict[str, Any]:
-    try:
-        fields: dict[str, Any] = parse_json(text, "the answer", finite=False)
-    except UserError:
-        return {}
-    return fields
+    for value in point:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        # `math.isfinite` takes no integer that is too large for a float.
+        if not is_number or value != value or abs(value) == math.inf:
+            return "a point is made of two numbers"
+    if not all(0 <= value <= THOUSAND for value in point):
+        return f"a point lies within 0 and {THOUSAND}"
+    return None
 
 
 class ModelPlayer(Player):
@@ -268,18 +260,15 @@ class QwenPlayer(ModelPlayer):
             titled_clips.append(("The video that comes before you act", list(first.frames[:-1])))
         for reveal, decision in zip(motions, session.decisions, strict=True):
             titled_clips.append((f"You chose {choice_text(decision)}", list(reveal.frames)))
-        clips = [(title, bool(frames)) for title, frames in titled_clips]
-        user = full_question(session.goal, session.options, clips, complaint)
-        return Question(
-            SYSTEM,
-            user,
-            [session.frame],
-            [self._clip(frames) for _, frames in titled_clips if frames],
-        )
-
-    def _clip(self, frames: list[np.ndarray]) -> Clip:
-        indices = sample_video(len(frames), most=self.clip_frames)
-        return Clip(np.stack([frames[i] for i in indices]), indices, len(frames))
+        titles: list[tuple[str, bool]] = []
+        clips: list[Clip] = []
+        for title, frames in titled_clips:
+            titles.append((title, bool(frames)))
+            if frames:
+                indices = sample_video(len(frames), most=self.clip_frames)
+                clips.append(Clip(np.stack([frames[i] for i in indices]), indices, len(frames)))
+        user = full_question(session.goal, session.options, titles, complaint)
+        return Question(SYSTEM, user, [session.frame], clips)
 
 
 @PLAYERS.register("openai")

@@ -163,9 +163,10 @@ def read_arm(spec: Any) -> Arm:
 def read_arms(specs: Any) -> list[Arm]:
     """Arms of `with`, each once."""
     arms = [read_arm(spec) for spec in listed_arms(specs)]
-    names = [arm.name for arm in arms]
-    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
-        raise UserError(f"with= names {twice[0]} twice.")
+    names: set[str] = set()
+    for arm in arms:
+        require(arm.name not in names, f"with= names {arm.name} twice.")
+        names.add(arm.name)
     return arms
 
 

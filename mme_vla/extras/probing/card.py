@@ -4,6 +4,7 @@ recovers from a wrong one.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -207,13 +208,14 @@ def measure_card(
     channel = channel_of(policy)
     in_simulation = options.base is make_env and settings.env == "mme_vla"
     arms = {label: read_arm(word) for label, word in interventions.items()}
-    possible, notes = [], []
+    possible: dict[str, str] = {}  # those of `interventions` that can be measured
+    notes = []
     for label, arm in arms.items():
         why = lacking(
             arm, policy, channel, len(plan.lend), boundaries=in_simulation, n_goals=plan.n_goals
         )
         if why is None:
-            possible.append(label)
+            possible[label] = interventions[label]
         else:
             notes.append(f"{label} ({interventions[label]}) was left out: it needs {why}.")
     others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
@@ -224,7 +226,7 @@ def measure_card(
         )
 
     # In closed loop: every arm, then the matched run again with other noise.
-    plan = replace(plan, arms=[interventions[label] for label in possible], events=())
+    plan = replace(plan, arms=list(possible.values()), events=())
     run_probe(policy, replace(plan, recordings=()), folder, facts, settings, options)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
@@ -235,7 +237,7 @@ def measure_card(
     can_recover = policy.info.resamples and WRONG_SCENE in possible
     if plan.recordings and len(plan.lend) > 1 and can_recover:
         offline = replace(plan.offline, moments=None, scan=False)
-        wrong = replace(plan, arms=[interventions[WRONG_SCENE]], jobs=(), offline=offline)
+        wrong = replace(plan, arms=[possible[WRONG_SCENE]], jobs=(), offline=offline)
         run_probe(policy, wrong, folder, facts, settings, options)
         recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
     writing = None
@@ -245,11 +247,10 @@ def measure_card(
         notes.append(writing)
 
     # The scenes that are the same in every run.
-    unprobed = ended_scenes(folder / ONLINE / slug(UNPROBED.name), plan)
+    online = folder / ONLINE
+    unprobed = ended_scenes(online / slug(UNPROBED.name), plan)
     equal = ended_scenes(folder / AGAIN, plan)
-    probed = {
-        label: ended_scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible
-    }
+    probed = {label: ended_scenes(online / slug(arms[label].name), plan) for label in possible}
     same = pair([unprobed, equal, *probed.values()])
     notes += same.gaps("The arms")
     require(same.keys or not same.left_out, " ".join(same.gaps("The arms")))
@@ -259,14 +260,15 @@ def measure_card(
         notes += beside.notes(f"references.{name}")
         if beside.keys:
             success_of_references[name] = _mean(_success(records, beside.keys))
-    matched, repeated = (_success(side, same.keys) for side in (unprobed, equal))
+    matched = _success(unprobed, same.keys)
+    repeated = _success(equal, same.keys)
     outcomes = {label: _success(side, same.keys) for label, side in probed.items()}
     suites = environment(settings.env).suites_of(job.task for job in plan.jobs)
     return replace(
         grade(matched, outcomes, repeated),
         model=facts.model,
         checkpoint=facts.checkpoint,
-        interventions={label: interventions[label] for label in possible},
+        interventions=possible,
         suites=clock_scores(matched, outcomes, repeated, suites),
         recovery=recovered,
         references=success_of_references,
@@ -396,7 +398,7 @@ Scenes = dict[EpisodeKey, list[EpisodeRecord]]
 
 def _success(records: Scenes, keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, float]:
     """Success of these scenes."""
-    return outcomes_of(record for key in keys for record in records[key])
+    return outcomes_of(chain.from_iterable(records[key] for key in keys))
 
 
 def ended_scenes(folder: Path, plan: ProbePlan) -> Scenes:
@@ -418,7 +420,7 @@ def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
         f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same"
         " ones.",
     )
-    for record in (record for of_scene in records.values() for record in of_scene):
+    for record in chain.from_iterable(records.values()):
         require(
             name != MEMORYLESS or not memory_of(record.model) or is_standing(record.model),
             f"references.{name} holds records of {record.model}, which has a memory: name those of"
@@ -447,7 +449,9 @@ def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
     if not columns:
         return np.zeros((0, _SAMPLES))
     tables = [_by_task(column) for column in columns]
-    tasks = {task: [table[task][:, None] for table in tables] for task in tables[0]}
+    tasks = {}
+    for task in tables[0]:
+        tasks[task] = [table[task][:, None] for table in tables]
     return resampled_means(tasks, _SAMPLES, seed=0)
 
 
@@ -478,9 +482,8 @@ def tables_of(card: Card) -> list[Table]:
     """The card as tables."""
     after = card.recovery
     rows = [["memory-or-clock score", _score(card.memory_or_clock)]]
-    rows += [
-        [f"memory-or-clock score, {suite}", _score(score)] for suite, score in card.suites.items()
-    ]
+    for suite, score in card.suites.items():
+        rows.append([f"memory-or-clock score, {suite}", _score(score)])
     rows.append(["noise: scenes that end otherwise in an equal run", percent(card.noise)])
     if after is not None:
         median = "no" if after.median is None else f"{after.median:g} decisions"
@@ -499,9 +502,8 @@ def tables_of(card: Card) -> list[Table]:
             f"[{100 * loss.low:.0f}, {100 * loss.high:.0f}]", f"{loss.lost} : {loss.gained}",
             "yes" if loss.beyond_noise else "no",
         ])  # fmt: skip
-    arms += [
-        [name, "", percent(rate), "", "", "", ""] for name, rate in (card.references or {}).items()
-    ]
+    for name, rate in (card.references or {}).items():
+        arms.append([name, "", percent(rate), "", "", "", ""])
     columns = "history", "intervention", "success", "loss", "95 %", "lost : gained", "beyond noise"
     return [
         Table("In short", ("figure", "value"), rows),

@@ -60,11 +60,10 @@ class Remembered:
 
     def without(self, slots: Sequence[int]) -> "Remembered":
         """The same with these slots empty."""
-        gone = set(slots)
-        return replace(
-            self,
-            entries=tuple(None if i in gone else entry for i, entry in enumerate(self.entries)),
-        )
+        remaining = list(self.entries)
+        for slot in slots:
+            remaining[slot] = None
+        return replace(self, entries=tuple(remaining))
 
     def rearranged(self, slots: Sequence[int], contents: Sequence[Any]) -> "Remembered":
         """The same with other contents at these slots; times stay."""
@@ -79,10 +78,11 @@ class Remembered:
         """Ages of the entries that are otherwise in `other`: taken away, of another content, or at
         another time.
         """
-        pairs = enumerate(zip(self.entries, other.entries, strict=True))
-        return [
-            self.age(slot) for slot, (mine, its) in pairs if mine is not its and mine is not None
-        ]
+        ages = []
+        for slot, (mine, its) in enumerate(zip(self.entries, other.entries, strict=True)):
+            if mine is not its and mine is not None:
+                ages.append(self.age(slot))
+        return ages
 
 
 def same_progress(slots: Sequence[int], count: int) -> np.ndarray:
@@ -130,11 +130,16 @@ class OnlyFrames(History):
 
     @property
     def scores(self) -> FrameScores:
-        rows = {frame: i for i, frame in enumerate(self._full_history.scores.frames.tolist())}
-        # The first frame is remembered whatever its score, as that of an episode is.
-        pairs = [(mine, rows[its]) for mine, its in self.frames.items() if mine and its in rows]
-        values = self._full_history.scores.values[[row for _, row in pairs]]
-        return FrameScores(np.array([mine for mine, _ in pairs], np.int64), values)
+        full = self._full_history.scores
+        row_of = {frame: row for row, frame in enumerate(full.frames.tolist())}
+        frames = []
+        rows = []
+        for mine, its in self.frames.items():
+            # The first frame is remembered whatever its score, as that of an episode is.
+            if mine and its in row_of:
+                frames.append(mine)
+                rows.append(row_of[its])
+        return FrameScores(np.array(frames, np.int64), full.values[rows])
 
     def gather(self, indices: np.ndarray) -> Tensor:
         its = np.array([self.frames[frame] for frame in indices[:, 0].tolist()], np.int64)
@@ -170,18 +175,21 @@ class Exchanged(History):
         return torch.cat(rows) if rows else self._full_history.motion_rows(frames)
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        parts = []
-        for frame, patch in indices.tolist():
+        # History → the rows of `indices` that it holds
+        rows_of: dict[History, list[int]] = {}
+        its_indices = indices.astype(np.int64)
+        for row, frame in enumerate(indices[:, 0].tolist()):
             history, its = self._places.get(frame, (self._full_history, frame))
-            parts.append((history, [its, patch]))
-        rows: list[Tensor | None] = [None] * len(parts)
-        for history in dict.fromkeys(history for history, _ in parts):
-            at = [i for i, (source, _) in enumerate(parts) if source is history]
-            tokens = history.gather(np.array([parts[i][1] for i in at], np.int64))
-            for i, row in zip(at, tokens, strict=True):
-                rows[i] = row
-        present = [row for row in rows if row is not None]
-        return torch.stack(present) if present else self._full_history.gather(indices)
+            its_indices[row, 0] = its
+            rows_of.setdefault(history, []).append(row)
+        if not rows_of:
+            return self._full_history.gather(indices)
+        order: list[int] = []
+        tokens = []
+        for history, rows in rows_of.items():
+            order += rows
+            tokens.append(history.gather(its_indices[rows]))
+        return torch.cat(tokens)[np.argsort(order)]
 
 
 @dataclass(frozen=True)
@@ -318,11 +326,11 @@ class WritableChannel(Channel):
         self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]
     ) -> Any:
         assert isinstance(episode, WritableMemory)
-        entries = [
-            [(entry.time, entry.content) for entry in store.entries if entry is not None]
-            for store in stores
-        ]
-        return episode.with_entries(entries)
+        contents = []
+        for store in stores:
+            present = [entry for entry in store.entries if entry is not None]
+            contents.append([(entry.time, entry.content) for entry in present])
+        return episode.with_entries(contents)
 
     def commit(self, episode: Episode, remembering: Any) -> None:
         assert isinstance(episode, WritableMemory)
@@ -334,8 +342,6 @@ def channel_of(policy: Policy) -> Channel:
     if policy.memory is not None:
         return SelectionChannel(policy)
     episode = policy.start_episode("")
-    return (
-        WritableChannel(policy, episode.memory_clock)
-        if isinstance(episode, WritableMemory)
-        else Channel(policy)
-    )
+    if isinstance(episode, WritableMemory):
+        return WritableChannel(policy, episode.memory_clock)
+    return Channel(policy)

@@ -63,7 +63,8 @@ def _on_recordings(findings: Findings) -> str:
             f"{cause} changes the actions by {mean.change:.2f} (1 is half of what the training data"
             f" span), and noise changes nothing: {reads} ({findings.size})."
         )
-    sentence = f"{cause} changes the actions {show_times(mean.times)} times as much as noise does"
+    times = f"{mean.times:.0f}" if mean.times >= 10 else f"{mean.times:.1f}"
+    sentence = f"{cause} changes the actions {times} times as much as noise does"
     return f"{sentence}{_against_noise(by_recording(lines), mean, reads)} ({findings.size})."
 
 
@@ -95,16 +96,19 @@ def _against_noise(episodes: Sequence[Effect], mean: Effect, reads: str) -> str:
 
 def _in_closed_loop(comparisons: Sequence[Comparison]) -> str:
     """One arm gets its verdict, of several those that cost success, or why none is known to."""
-    named = [comparison for comparison in comparisons if comparison.first == EVERYTHING]
-    if len(comparisons) == 1 or (named and not named[0].significant):
-        verdict = f"In closed loop: {[*named, *comparisons][0].verdict}."
-        if len(comparisons) == 1:
-            return verdict
-    else:
-        verdict = ""
+    if len(comparisons) == 1:
+        return f"In closed loop: {comparisons[0].verdict}."
+    verdict = ""
+    worse = []
+    better = []
+    for comparison in comparisons:
+        if not verdict and comparison.first == EVERYTHING and not comparison.significant:
+            verdict = f"In closed loop: {comparison.verdict}."
+        if comparison.significant and comparison.losses > comparison.wins:
+            worse.append(comparison.first)
+        elif comparison.significant and comparison.wins > comparison.losses:
+            better.append(comparison.first)
     n_arms = f"the {len(comparisons)} interventions in closed loop"
-    worse = [c.first for c in comparisons if c.significant and c.losses > c.wins]
-    better = [c.first for c in comparisons if c.significant and c.wins > c.losses]
     if worse or better:
         found = []
         if worse:
@@ -122,8 +126,3 @@ def _in_closed_loop(comparisons: Sequence[Comparison]) -> str:
     else:
         sentence = f"None of {n_arms} changes success significantly."
     return f"{verdict} {sentence}".strip()
-
-
-def show_times(times: float) -> str:
-    """How many times the own spread an effect is, as one prints it."""
-    return f"{times:.0f}" if times >= 10 else f"{times:.1f}"

@@ -35,15 +35,21 @@ class Effect:
 
 def effect(lines: Sequence[MomentLine] | Sequence[EntryLine]) -> Effect:
     """The effect over some lines, at least one."""
-    changes = np.array([line.change for line in lines])
-    spreads = np.array([line.spread for line in lines])
-    distances = np.array([getattr(line, "distance", 0.0) for line in lines])
+    changes = []
+    spreads = []
+    distances = []
+    n_beyond = 0
+    for line in lines:
+        changes.append(line.change)
+        spreads.append(line.spread)
+        distances.append(line.distance if isinstance(line, MomentLine) else 0.0)
+        n_beyond += line.change > line.spread
     return Effect(
         moments=len(lines),
-        change=float(changes.mean()),
-        spread=float(spreads.mean()),
-        distance=float(distances.mean()),
-        beyond=float((changes > spreads).mean()),
+        change=float(np.mean(changes)),
+        spread=float(np.mean(spreads)),
+        distance=float(np.mean(distances)),
+        beyond=n_beyond / len(lines),
     )
 
 
@@ -57,11 +63,14 @@ class Findings:
     @classmethod
     def of(cls, lines: Iterable[Line]) -> "Findings":
         """Sort the lines."""
-        every = list(lines)
-        return cls(
-            [x for x in every if isinstance(x, MomentLine)],
-            [x for x in every if isinstance(x, EntryLine)],
-        )
+        moments: list[MomentLine] = []
+        entries: list[EntryLine] = []
+        for line in lines:
+            if isinstance(line, MomentLine):
+                moments.append(line)
+            else:
+                entries.append(line)
+        return cls(moments, entries)
 
     def arms(self) -> dict[str, Effect]:
         """The effect of every arm, in the order in which they came."""

@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -87,16 +88,15 @@ _NAMES = {kind: name for name, kind in _KINDS.items()}
 
 def append(path: Path, lines: Iterable[Line], recording: str) -> None:
     """Add all lines of a recorded episode at once, and that it is done."""
-    rows = [
-        with_checksum({"kind": _NAMES[type(line)], **asdict(line)})
-        for line in [*lines, DoneLine(recording)]
-    ]
+    text = ""
+    for line in [*lines, DoneLine(recording)]:
+        row = with_checksum({"kind": _NAMES[type(line)], **asdict(line)})
+        text += json.dumps(row, separators=(",", ":")) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
         content = path.read_bytes()
         length = _complete_length(content)
         file.truncate(length)
-        text = "".join(json.dumps(row, separators=(",", ":")) + "\n" for row in rows)
         file.write(b"\n" * (length > 0 and content[length - 1 : length] != b"\n") + text.encode())
         file.flush()
         os.fsync(file.fileno())
@@ -123,19 +123,24 @@ def read(path: Path) -> tuple[list[Line], set[str]]:
     """The lines of recorded episodes that are done, and which these are; nothing where there is no
     file.
     """
+    if not path.exists():
+        return [], set()
     pending: dict[str, list[Line]] = {}
     done: dict[str, list[Line]] = {}
-    for line in read_lines(path, _from_dict, "lines of a probe") if path.exists() else []:
+    for line in read_lines(path, _from_dict, "lines of a probe"):
         if isinstance(line, DoneLine):
             done[line.recording] = pending.pop(line.recording, [])
         else:
             pending.setdefault(line.recording, []).append(line)
-    return [line for lines in done.values() for line in lines], set(done)
+    return list(chain.from_iterable(done.values())), set(done)
 
 
 def read_all(folder: Path) -> list[Line]:
     """The lines of every shard."""
-    return [line for path in sorted(folder.glob(LINES)) for line in read(path)[0]]
+    lines: list[Line] = []
+    for path in sorted(folder.glob(LINES)):
+        lines += read(path)[0]
+    return lines
 
 
 def _from_dict(row: dict[str, Any]) -> Line | DoneLine:

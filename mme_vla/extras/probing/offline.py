@@ -47,14 +47,10 @@ def compare_chunks(before: Tensor, after: Tensor) -> Change:
     second = after.double().flatten(1).numpy()
     across = _distances(first, second)
     within = _distances(first, first)
+    n = len(within)
+    spread = float(within.sum() / (n * (n - 1))) if n > 1 else 0.0  # between different rows
     energy = 2 * across.mean() - within.mean() - _distances(second, second).mean()
-    return Change(float(np.diagonal(across).mean()), std_of(within), float(max(energy, 0.0)))
-
-
-def std_of(distances: np.ndarray) -> float:
-    """Mean of the distances [n, n] between different rows; 0 for one row."""
-    n = len(distances)
-    return float(distances.sum() / (n * (n - 1))) if n > 1 else 0.0
+    return Change(float(np.diagonal(across).mean()), spread, float(max(energy, 0.0)))
 
 
 def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -109,26 +105,26 @@ class _Moments:
         self._by_feed: dict[Feed, list[ProbedPolicy]] = defaultdict(list)
         for arm in [UNPROBED, *arms]:
             self._by_feed[arm.feed].append(ProbedPolicy(policy, arm, sessions, donors).eval())
-        self._draws = self._shared_noise()
+        # Of each step, the noise that all arms share
+        generator = torch.Generator().manual_seed(self._seed)
+        self._draws: dict[int, list[Noise]] = {step: [] for step in self._steps}
+        for noise_of_step in self._draws.values():
+            for _ in range(settings.draws):
+                noise_of_step.append(policy.sampling_noise(generator))
         self._baseline: dict[int, Tensor] = {}  # Unprobed chunks [draws, h, w] of each step
 
     def lines(self) -> list[Line]:
         """All lines."""
-        return [line for probed in self._by_feed.values() for line in self._watch(probed)]
-
-    def _shared_noise(self) -> dict[int, list[Noise]]:
-        generator = torch.Generator().manual_seed(self._seed)
-        draws: dict[int, list[Noise]] = {step: [] for step in self._steps}
-        for noise_of_step in draws.values():
-            for _ in range(self._settings.draws):
-                noise_of_step.append(self._policy.sampling_noise(generator))
-        return draws
+        result: list[Line] = []
+        for probed in self._by_feed.values():
+            result += self._watch(probed)
+        return result
 
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
         """Run the episode once for arms with the same feed."""
         result: list[Line] = []
-        recording, first = self._recording, arms[0]
-        episode = first.start_episode(recording.goal, self._seed)
+        recording = self._recording
+        episode = arms[0].start_episode(recording.goal, self._seed)
         episode.recording = recording
         required = self._required_frames(arms)
         n_observed = 0
@@ -192,7 +188,8 @@ class _Moments:
         )
         result: list[Line] = []
         for (i, slot), chunk in zip(places, chunks, strict=True):
-            change, entry = compare_chunks(self._baseline[step], chunk), stores[i].entries[slot]
+            change = compare_chunks(self._baseline[step], chunk)
+            entry = stores[i].entries[slot]
             assert entry is not None
             result.append(
                 EntryLine(

@@ -3,7 +3,7 @@ are not.
 """
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -221,17 +221,13 @@ class DonorEpisode:
         self._episode: Episode | None = None
         self._policy = policy
 
-    def store_of(self, episode: ProbedEpisode) -> Callable[[str], Remembered]:
-        """The store of a name, as many execution frames in as `episode` is; of banks, as it was in
-        the end.
+    def store(self, episode: ProbedEpisode, name: str) -> Remembered:
+        """The store of this name, as many execution frames in as `episode` is; of banks, as it was
+        in the end.
         """
-
-        def store(name: str) -> Remembered:
-            step = self._step(episode) if self._channel.chooses else None
-            stores = self._channel.read(self._observed(), step).stores
-            return next(store for store in stores if store.name == name)
-
-        return store
+        step = self._step(episode) if self._channel.chooses else None
+        stores = self._channel.read(self._observed(), step).stores
+        return next(store for store in stores if store.name == name)
 
     def subgoal_of(self, episode: ProbedEpisode) -> str | None:
         """The subgoal there, as many execution frames in."""
@@ -376,13 +372,15 @@ class ProbedPolicy(Policy):
         return np.union1d(feed.source_frames(reads, exec_start, n_before), paused)
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
+        inner = []
         for episode in map(_probed, episodes):
             episode.show_collected()
             moment = self.moment(episode)
             episode.inner.goal = self.arm.instruct(episode.goal, moment)
             episode.subgoals.append(episode.subgoal)
             episode.inner.subgoal = self.arm.say(episode.subgoal, moment)
-        return self.inner.observation([_probed(episode).inner for episode in episodes])
+            inner.append(episode.inner)
+        return self.inner.observation(inner)
 
     def predict_chunk(
         self,
@@ -434,7 +432,7 @@ class ProbedPolicy(Policy):
         if self.donors is not None:
             donor = self.donors.of(episode)
             known |= {
-                "donor": donor.store_of(episode),
+                "donor": partial(donor.store, episode),
                 "donor_subgoal": donor.subgoal_of(episode),
                 "donor_recording": donor.recording,
                 "donor_goal": self.donors.goal_for(episode),
@@ -451,9 +449,10 @@ class ProbedPolicy(Policy):
     ) -> np.ndarray:
         """By how much a chunk changes without each slot of a store."""
         slots = store.occupied
-        variants = [store, *(store.without([slot]) for slot in slots)]
-        stores = [[*snapshot.stores[:place], v, *snapshot.stores[place + 1 :]] for v in variants]
-        chunks = self.ask(episode, snapshot, stores, [sampled])
+        variants = []
+        for candidate in [store, *(store.without([slot]) for slot in slots)]:
+            variants.append([*snapshot.stores[:place], candidate, *snapshot.stores[place + 1 :]])
+        chunks = self.ask(episode, snapshot, variants, [sampled])
         changes = np.zeros(len(store))
         changes[slots] = (chunks[1:, 0] - chunks[0, 0]).square().mean((1, 2)).sqrt().numpy()
         return changes
@@ -475,18 +474,18 @@ class ProbedPolicy(Policy):
         draws: the random numbers that all variants share.
         batch: most chunks that are chosen at once.
         """
+        memories: list[Any] = []
+        noises: list[Noise] = []
+        for variant in variants:
+            memory = self.channel.counterfactual(episode.inner, snapshot, variant)
+            memories += [memory] * len(draws)
+            noises += draws
         chunks = []
-        pairs = [(variant, sampled) for variant in variants for sampled in draws]
-        ready = {
-            id(variant): self.channel.counterfactual(episode.inner, snapshot, variant)
-            for variant in variants
-        }
-        for start in range(0, len(pairs), batch):
-            part = pairs[start : start + batch]
+        for start in range(0, len(memories), batch):
+            part = memories[start : start + batch]
             observation = self.inner.observation([episode.inner] * len(part))
-            memories = [ready[id(variant)] for variant, _ in part]
-            stacked = stack_noise([sampled for _, sampled in part])
-            chunk = self.channel.predict_chunk(observation, memories, stacked, steps)
+            stacked = stack_noise(noises[start : start + batch])
+            chunk = self.channel.predict_chunk(observation, part, stacked, steps)
             chunks.append(chunk.float().cpu())
         action = self.embodiment.action
         stacked_chunks = torch.cat(chunks).unflatten(0, (len(variants), len(draws)))

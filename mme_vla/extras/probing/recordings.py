@@ -31,4 +31,7 @@ class Recording(recording.Recording):
 
 def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
     """Every episode of some datasets."""
-    return [Recording(source, episode) for source in sources for episode in range(len(source))]
+    recordings = []
+    for source in sources:
+        recordings += [Recording(source, episode) for episode in range(len(source))]
+    return recordings

@@ -67,8 +67,10 @@ def arms_table(findings: Findings, meanings: Mapping[str, str] | None = None) ->
     """Every arm over all decisions. meanings: what each does, for a column of its own."""
     rows = []
     for name, effect_of in findings.arms().items():
-        lines = [line for line in findings.moments if line.arm == name]
-        ages = [age for line in lines for age in line.touched]
+        ages: list[int] = []
+        for line in findings.moments:
+            if line.arm == name:
+                ages += line.touched
         row = [name]
         if meanings is not None:
             row.append(meanings.get(name, ""))
@@ -289,17 +291,15 @@ def decay(findings: Findings) -> str:
     """What an entry matters by its age, those of the video and of the execution."""
     with figure((5.6, 3.4)) as (canvas, (axes,)):
         for name, video, colour in (("video", True, COLOURS[0]), ("execution", False, COLOURS[1])):
-            points = findings.decay(video)
-            mine = [e for e in findings.entries if e.video == video]
-            if mine:
-                axes.scatter(
-                    [e.age for e in mine],
-                    [e.change for e in mine],
-                    s=12,
-                    color=colour,
-                    alpha=0.45,
-                    lw=0,
-                )
+            ages = []
+            changes = []
+            for entry in findings.entries:
+                if entry.video == video:
+                    ages.append(entry.age)
+                    changes.append(entry.change)
+            if ages:
+                axes.scatter(ages, changes, s=12, color=colour, alpha=0.45, lw=0)
+                points = findings.decay(video)
                 means = [point.change for _, point in points]
                 axes.plot([age for age, _ in points], means, "-o", color=colour, ms=5, label=name)
         stds = [entry.spread for entry in findings.entries]
@@ -334,19 +334,18 @@ def _plot_dial(
     points: Sequence[tuple[float, Effect]],
     dial: Dial,
 ) -> None:
-    for place, _ in points:
-        lines = [
-            line
-            for line in findings.moments
-            if line.dial == place and line.arm.partition(":")[0] == name
-        ]
+    of_family = [line for line in findings.moments if line.arm.partition(":")[0] == name]
+    places: list[float] = []
+    means: list[float] = []
+    if dial.neutral:
+        places.append(0)
+        means.append(0)
+    for place, effect_of in points:
+        lines = [line for line in of_family if line.dial == place]
         values = [episode.change for episode in by_recording(lines)]
         axes.plot([place] * len(values), values, "o", color=INK, ms=3, alpha=0.5, lw=0)
-    places = [place for place, _ in points]
-    means = [effect_of.change for _, effect_of in points]
-    if dial.neutral:
-        places = [0, *places]
-        means = [0, *means]
+        places.append(place)
+        means.append(effect_of.change)
     axes.plot(places, means, "-o", color=COLOURS[0], ms=5)
     axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
     axes.set_ylim(bottom=0)
@@ -373,7 +372,8 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording, columns: 
     recording: theirs.
     columns: frames a row.
     """
-    step, tiles = lines[0].step, []
+    step = lines[0].step
+    tiles = []
     for line in sorted(lines, key=lambda line: line.time):
         label = f"{line.age} ago: {line.change:.2f}"
         tiles.append(Tile(recording.frame(line.time), label, VIDEO if line.video else EXECUTION))
@@ -557,8 +557,9 @@ def _offline_sections(findings: Findings, meanings: Mapping[str, str]) -> list[S
 
 def table_of(findings: Mapping[str, Findings]) -> str:
     """Several checkpoints beside each other, in Markdown, and what the columns mean."""
-    measures = ((name, question) for name, (_, question) in MEASURES.items())
-    terms = [f"- {name}: {meaning}" for name, meaning in (*measures, REACH, FROM_VIDEO)]
+    terms = [f"- {name}: {question}" for name, (_, question) in MEASURES.items()]
+    for name, meaning in (REACH, FROM_VIDEO):
+        terms.append(f"- {name}: {meaning}")
     return "\n".join([to_markdown(checkpoints_table(dict(findings))), *terms, "", UNITS])
 
 

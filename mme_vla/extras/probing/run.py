@@ -319,16 +319,18 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
     protocol = Protocol.of_records(records)
     methods = aggregate(records, protocol, split).methods
     unprobed = [method for method in methods if method.model == model and method.event is None]
+    baseline = unprobed[0] if unprobed else None
     for method in methods:
-        if method in unprobed[:1]:
+        if method is baseline:
             method.label = UNPROBED.name
         elif method.event is not None:
             method.label = f"event {method.event}"
         else:
             method.label = method.model.removeprefix(f"{model}{ARM}")
+    if baseline is None:
+        return []
     pairs = []
-    for baseline in unprobed[:1]:
-        for method in methods:
-            if method is not baseline and common_episodes(method, baseline):
-                pairs.append((method, baseline))
+    for method in methods:
+        if method is not baseline and common_episodes(method, baseline):
+            pairs.append((method, baseline))
     return compare_all(pairs, protocol)

@@ -67,11 +67,12 @@ class Shown:
 
     def join(self, after: "Shown") -> "Shown":
         """These frames, then those."""
+        views = {}
+        for name, view in self.views.items():
+            views[name] = np.concatenate([view, after.views[name]])
         return replace(
             self,
-            views={
-                name: np.concatenate([view, after.views[name]]) for name, view in self.views.items()
-            },
+            views=views,
             states=np.concatenate([self.states, after.states]),
             demo=np.concatenate([self.demo, after.demo]),
             numbers=np.concatenate([self.numbers, after.numbers]),

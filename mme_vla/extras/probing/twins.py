@@ -323,11 +323,11 @@ def _recorded_actions(spec: EpisodeSpec, robot: Embodiment) -> Sequence[np.ndarr
         frames = Recorder(task, render=False).record().frames
     finally:
         task.close()
-    if all(frame.info["is_video_demo"] for frame in frames):
+    executed = [frame for frame in frames if not frame.info["is_video_demo"]]
+    if not executed:
         return ()
     if space == "waypoint":
         return list(motions_of(frames).targets)
-    executed = [frame for frame in frames if not frame.info["is_video_demo"]]
     return [np.asarray(frame.action[_RECORDED[space]], np.float32) for frame in executed]
 
 
@@ -484,11 +484,16 @@ def _accuracies(tasks: Sequence[Sequence[TwinLine]]) -> dict[str, Accuracy]:
     """Accuracy of each arm over the pairs of these tasks."""
     accuracies = {}
     for arm in tasks[0][0].arms:
-        shares = [np.array([[line.arms[arm]] for line in lines]) for lines in tasks]
-        chances = [np.mean([line.chance for line in lines]) for lines in tasks]
+        n_pairs = 0
+        shares: list[np.ndarray] = []  # of each task, [pairs, 1]
+        chances = []
+        for lines in tasks:
+            n_pairs += len(lines)
+            shares.append(np.array([[line.arms[arm]] for line in lines]))
+            chances.append(np.mean([line.chance for line in lines]))
         interval: Interval = mean_interval(shares)
         accuracies[arm] = Accuracy(
-            pairs=sum(len(lines) for lines in tasks),
+            pairs=n_pairs,
             accuracy=float(np.mean([outcomes.mean() for outcomes in shares])),
             low=interval.low,
             high=interval.high,

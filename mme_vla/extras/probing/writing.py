@@ -155,7 +155,10 @@ def operations_of(selection: Selection, facts: Sequence[Fact]) -> Operations:
     for decision in sorted(decisions):
         frames = selection(decision)
         needed = [fact for fact in facts if decision in fact.needed]
-        counts = [_frames_of(fact, frames) for fact in needed]
+        counts = []  # of each, how many of the frames show it
+        for fact in needed:
+            first, last = fact.frames
+            counts.append(int(((frames >= first) & (frames <= last)).sum()))
         of_decision = [count > 0 for count in counts]
         stored += of_decision
         n_stored.append(sum(of_decision))
@@ -166,12 +169,6 @@ def operations_of(selection: Selection, facts: Sequence[Fact]) -> Operations:
                 if other.frames[0] == fact.changed:
                     updated.append(new >= max(count, 1))
     return Operations(stored, updated, n_stored)
-
-
-def _frames_of(fact: Fact, frames: np.ndarray) -> int:
-    """How many of these frames show a fact."""
-    first, last = fact.frames
-    return int(((frames >= first) & (frames <= last)).sum())
 
 
 @dataclass

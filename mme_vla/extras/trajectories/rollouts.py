@@ -314,7 +314,8 @@ class _Collector(Rollout):
     @torch.no_grad()
     def choose(self, batch: Sequence[RunningEpisode]) -> np.ndarray:
         """The chunks of the policy, or of the oracle where it acts; every decision is kept."""
-        policy, episodes = self.policy, [running.episode for running in batch]
+        policy = self.policy
+        episodes = [running.episode for running in batch]
         observations: list[Batch] = []
         paths: list[SamplePath] = []
 
@@ -358,7 +359,8 @@ class _Collector(Rollout):
         """Whether the oracle takes this decision; a function of seed, episode and number of the
         decision.
         """
-        job, number = running.job, len(self._decisions[running])
+        job = running.job
+        number = len(self._decisions[running])
         rng = np.random.default_rng([self.settings.seed, job.episode, number, *job.task.encode()])
         return bool(rng.random() < self.oracle_share)
 
@@ -372,44 +374,43 @@ class _Collector(Rollout):
     def _trajectory(
         self, running: RunningEpisode, ending: Ending, decisions: Sequence[_Decision]
     ) -> Trajectory:
+        chunks: list[Tensor] = []
+        actions: list[np.ndarray] = []
+        rewards: list[float] = []
+        log_probs: list[Tensor] = []
+        paths: list[Tensor] = []
         executed: list[Batch] = []
         targets: list[Batch] = []
         for decision in decisions:
+            chunks.append(decision.chunk)
+            actions.append(decision.actions)
+            rewards.append(decision.reward)
+            if decision.log_prob is not None:
+                log_probs.append(decision.log_prob)
+            if decision.path is not None:
+                paths.append(decision.path)
             if decision.row is None:
                 continue
             executed.append(self._labelled(decision.row, decision.state, decision.actions))
             if decision.oracle is not None:
                 by_oracle = decision.oracle[None]
                 targets.append(self._labelled(decision.row, decision.state, by_oracle))
-        chunks = [decision.chunk for decision in decisions]
-        log_probs = [d.log_prob for d in decisions if d.log_prob is not None]
-        paths = [d.path for d in decisions if d.path is not None]
-        observations = None
-        rewards = None
-        oracle = None
-        if "observations" in self.keep and executed:
-            observations = join(executed)
-        if "rewards" in self.keep:
-            rewards = torch.tensor([decision.reward for decision in decisions])
-        if "oracle" in self.keep and targets:
-            oracle = join(targets)
+        stacked_chunks = torch.zeros(0, self.policy.horizon, self.policy.action_dim)
+        if chunks:
+            stacked_chunks = torch.stack(chunks)
         return Trajectory(
             running.job,
             ending.outcome,
             running.steps,
-            torch.stack(chunks) if chunks else torch.zeros(0, *self._chunk_shape),
-            tuple(decision.actions for decision in decisions),
-            observations,
-            rewards,
-            torch.stack(log_probs) if log_probs else None,
-            torch.stack(paths) if paths else None,
-            oracle,
-            ending.reason if ending.outcome == "error" else None,
+            stacked_chunks,
+            tuple(actions),
+            observations=join(executed) if "observations" in self.keep and executed else None,
+            rewards=torch.tensor(rewards) if "rewards" in self.keep else None,
+            log_probs=torch.stack(log_probs) if log_probs else None,
+            paths=torch.stack(paths) if paths else None,
+            oracle=join(targets) if "oracle" in self.keep and targets else None,
+            error=ending.reason if ending.outcome == "error" else None,
         )
-
-    @property
-    def _chunk_shape(self) -> tuple[int, int]:
-        return self.policy.horizon, self.policy.action_dim
 
     def _labelled(self, row: Batch, state: Tensor, actions: np.ndarray) -> Batch:
         """A row with these actions [n, w] in the network's units, repeated to a chunk, of which
@@ -434,11 +435,11 @@ def _with_memory(policy: MMEPolicy, observation: Batch, batch: Sequence[RunningE
     """The observation with the memory's selection and the options, as a row of training data has
     them.
     """
-    history, options = None, None
+    history = None
+    options = None
     if policy.memory is not None:
-        history = stack_history(
-            [running.episode.gather_selection() for running in batch], policy.device
-        )
+        selections = [running.episode.gather_selection() for running in batch]
+        history = stack_history(selections, policy.device)
     if letters := len(policy.embodiment.action.choice):
         options = torch.zeros(len(batch), letters, dtype=torch.bool, device=policy.device)
         for i, running in enumerate(batch):

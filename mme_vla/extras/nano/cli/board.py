@@ -157,7 +157,10 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
 
     folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
     local = read_rows([], local=[*folders, *trained])
-    shipped = published_rows(next((row[0].table for row in local.values()), split))
+    table_name = split
+    if local:
+        table_name = next(iter(local.values()))[0].table
+    shipped = published_rows(table_name)
     if shipped is not None:
         rows = read_rows([shipped], local=[*folders, *trained])
     else:

@@ -81,7 +81,8 @@ def _streamed(policy: Policy, batch: Any) -> int | None:
     memory = policy.memory
     if not isinstance(memory, RecurrentMemory):
         return None
-    history, last = batch.history, slice(-(memory.storage.grid**2), None)
+    history = batch.history
+    last = slice(-(memory.storage.grid**2), None)
     frame: Any = history.features[:, last], history.positions[:, last], history.mask[:, last]
     return flops(lambda: memory.read(memory.update(memory.init_state(1), *frame)))
 

@@ -47,8 +47,13 @@ def replay(
         The step a chunk was just chosen at, and the running episode.
     """
     check_episode(source, episode)
-    give_statistics(policy, source)
-    recording, n_observed = Recording(source, episode), 0
+    processor = policy.require_processor()
+    if processor.stats is None:  # a fresh policy has none: those of the data
+        processor.stats = compute_norm_stats(
+            [source], horizon=processor.embodiment.action.horizon, robot=processor.embodiment
+        )
+    recording = Recording(source, episode)
+    n_observed = 0
     text = SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text)
     running = policy.start_episode(recording.goal)
     for step in recording.decisions(stride, most):
@@ -84,15 +89,6 @@ def replay_all(
     return count
 
 
-def give_statistics(policy: MMEPolicy, source: EpisodeSource) -> None:
-    """Normalisation statistics for a fresh policy, which has none: those of the data."""
-    processor = policy.require_processor()
-    if processor.stats is None:
-        processor.stats = compute_norm_stats(
-            [source], horizon=processor.embodiment.action.horizon, robot=processor.embodiment
-        )
-
-
 @dataclass(frozen=True)
 class RecurrenceCurves:
     """One episode's recurrence: frames [t] it took, in order, and a number of each by name.
@@ -125,10 +121,9 @@ def recurrence_curves(
     history = running.required_history()
     window = running.gather_selection()
     with policy.autocast():
-        features, positions, mask = (
-            x[None].to(policy.device) for x in (window.features, window.positions, window.mask)
-        )
-        x = memory.encoder(features, positions, mask)
+        mask = window.mask[None].to(policy.device)
+        features = window.features[None].to(policy.device)
+        x = memory.encoder(features, window.positions[None].to(policy.device), mask)
         patches = memory.storage.grid**2
         frames = x.unflatten(1, (-1, patches))
         valid = mask.unflatten(1, (-1, patches)).all(-1)
@@ -153,9 +148,9 @@ def recurrence_plot(episodes: Sequence[RecurrenceCurves], title: str) -> str:
         for panel, name in zip(axes, panels, strict=True):
             for i, episode in enumerate(episodes):
                 colour = COLOURS[i % len(COLOURS)]
-                curve_styles = (
-                    [(_PAIR[0], "--"), (_PAIR[1], "-")] if name == "inner loss" else [(name, "-")]
-                )
+                curve_styles = [(name, "-")]
+                if name == "inner loss":
+                    curve_styles = [(_PAIR[0], "--"), (_PAIR[1], "-")]
                 for curve, style in curve_styles:
                     label = f"episode {episode.episode}" if style == "-" else None
                     panel.plot(
@@ -192,12 +187,11 @@ def selection_sheets(
     require(every >= 1, f"every={every} must be at least 1: the steps between two images.")
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
-    history, patches = (
-        OnlineHistory(memory.storage, memory.make_scorer(), start),
-        memory.storage.grid**2,
-    )
+    history = OnlineHistory(memory.storage, memory.make_scorer(), start)
+    patches = memory.storage.grid**2
     motion = normalised_states(source.states(episode, 0, length))
-    history.motion, history.state_width = motion.__getitem__, motion.shape[1]
+    history.motion = motion.__getitem__
+    history.state_width = motion.shape[1]
     n_observed = 0
     for step in range(start, length, every):
         part = frames[n_observed : step + 1]

@@ -32,11 +32,6 @@ class RerunLog:
         self._stream.save(str(path))
         self._episode = 0
 
-    def at(self, episode: int, step: int) -> None:
-        """What is logged next belongs here."""
-        self._episode = episode
-        self._stream.set_time("step", sequence=step)
-
     def log_image(self, name: str, pixels: np.ndarray | Image.Image) -> None:
         """Log an image [H, W, 3] uint8."""
         image = self._rerun.Image(np.asarray(pixels))
@@ -54,7 +49,8 @@ class RerunLog:
 
     def views(self, source: EpisodeSource, episode: int, step: int) -> None:
         """Go to a step of a recorded episode, and log its images and texts."""
-        self.at(episode, step)
+        self._episode = episode
+        self._stream.set_time("step", sequence=step)
         for view in source.robot.camera_names:
             self.log_image(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
         self.words("goal", source.goal(episode, step))

@@ -41,9 +41,10 @@ class AttentionMass:
         """(part, mean, maximum over layers) in percent; the actions' own share is of everything."""
         rows = []
         for part in self.parts:
-            values = (
-                self.layers[:, self.parts.index(part)] if part == "action" else self.share(part)
-            )
+            if part == "action":
+                values = self.layers[:, self.parts.index(part)]
+            else:
+                values = self.share(part)
             rows.append((part, 100 * float(values.mean()), 100 * float(values.max())))
         return rows
 
@@ -105,11 +106,11 @@ class AttentionWatch(Watch[AttentionMass]):
 
     def _hooks(self) -> list[Any]:
         transformer: Any = self.policy.backbone.transformer
-        layers = [
-            layer.register_forward_pre_hook(partial(self._layer, i), with_kwargs=True)
-            for i, layer in enumerate(transformer.layers)
-        ]
-        return [transformer.register_forward_pre_hook(self._begin, with_kwargs=True), *layers]
+        handles = [transformer.register_forward_pre_hook(self._begin, with_kwargs=True)]
+        for i, layer in enumerate(transformer.layers):
+            hook = partial(self._layer, i)
+            handles.append(layer.register_forward_pre_hook(hook, with_kwargs=True))
+        return handles
 
     def _read(self, sums: Tensor) -> AttentionMass:
         parts = list(dict.fromkeys(PARTS.get(name, name) for name in self._names))
@@ -124,10 +125,11 @@ class AttentionWatch(Watch[AttentionMass]):
         self._watching = blocks[-1].expert == transformer.action_expert
         if not self._watching:
             return
-        names = [span.name for span in layout.spans]
-        self._names, self._lengths = names, [span.length for span in layout.spans]
+        self._names = [span.name for span in layout.spans]
+        self._lengths = [span.length for span in layout.spans]
         if not self._sums.ndim:
-            self._sums = torch.zeros(len(transformer.layers), len(names), dtype=torch.float64)
+            shape = (len(transformer.layers), len(layout.spans))
+            self._sums = torch.zeros(shape, dtype=torch.float64)
         self._mask = layout_mask(layout.mask_layout, torch.float32)
 
     @torch.no_grad()
@@ -137,14 +139,15 @@ class AttentionWatch(Watch[AttentionMass]):
         names = ("segments", "rope", "mask", "condition", "hook", "past")
         arguments = {**dict.fromkeys(names), **dict(zip(names, args, strict=False)), **kwargs}
         segments, condition = arguments["segments"], arguments["condition"]
-        of_attention = (
-            condition.attention if isinstance(condition, LayerTimeModulation) else condition
-        )
+        of_attention = condition
+        if isinstance(condition, LayerTimeModulation):
+            of_attention = condition.attention
         past: KeyValue | StaticKV | None = arguments["past"]
         if isinstance(past, StaticKV):
             past = past.past()
         keys: list[Tensor] = [] if past is None else [past[0]]
-        row, q = 0, None
+        row = 0
+        q = None
         for segment in segments:
             rows = slice(row, row + segment.tokens.shape[1])
             answers = segment.expert == block.action_expert
@@ -189,23 +192,26 @@ class ModulationWatch(Watch[ModulationStats]):
             )
         if not self._sums.ndim:
             self._sums = torch.zeros(len(integration.layers), 2, 3, dtype=torch.float64)
-        linears: list[Any] = [layer.modulation for layer in integration.layers]
-        return [
-            linear.register_forward_hook(partial(self._take, i)) for i, linear in enumerate(linears)
-        ]
+        handles = []
+        for i, layer in enumerate(integration.layers):
+            linear: Any = layer.modulation
+            handles.append(linear.register_forward_hook(partial(self._take, i)))
+        return handles
 
     def _read(self, sums: Tensor) -> ModulationStats:
         mean, std = _moments(sums)  # depth × (scale, bias) × (count, sum, squares)
         means, stds = _moments(sums.sum(0))
         overall = {
-            name: (float(means[i]), float(stds[i])) for i, name in enumerate(("scale", "bias"))
+            "scale": (float(means[0]), float(stds[0])),
+            "bias": (float(means[1]), float(stds[1])),
         }
         return ModulationStats((mean[:, 0], std[:, 0]), (mean[:, 1], std[:, 1]), overall)
 
     def _take(self, index: int, _module: nn.Module, _args: tuple, output: Tensor) -> None:
-        parts = [part.detach().double() for part in output.chunk(2, dim=-1)]
-        rows = [[part.new_tensor(part.numel()), part.sum(), part.square().sum()] for part in parts]
-        self._sums[index] += torch.stack([torch.stack(row) for row in rows]).cpu()
+        for row, part in enumerate(output.chunk(2, dim=-1)):
+            values = part.detach().double()
+            sums = [values.new_tensor(values.numel()), values.sum(), values.square().sum()]
+            self._sums[index, row] += torch.stack(sums).cpu()
 
 
 def _moments(sums: Tensor) -> tuple[Tensor, Tensor]:

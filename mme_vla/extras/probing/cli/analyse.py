@@ -59,15 +59,18 @@ def attention(args: argparse.Namespace) -> None:
 
     policy, source, name = _subject(args)
     watch = AttentionWatch(policy)
-    laps = lambda: {f"attention/{part}": mean for part, mean, _ in watch.lap().table()}  # noqa: E731
+
+    def laps() -> dict[str, float]:
+        return {f"attention/{part}": mean for part, mean, _ in watch.lap().table()}
+
     chunks = _watch(args, watch, laps, policy, source)
     mass = watch.result()
     known = _paper("attention_allocation", name)
     rows = []
     for part, mean, most in mass.table():
-        printed = (
-            f"{known[f'{part}_mean']} / {known[f'{part}_max']}" if f"{part}_mean" in known else ""
-        )
+        printed = ""
+        if f"{part}_mean" in known:
+            printed = f"{known[f'{part}_mean']} / {known[f'{part}_max']}"
         rows.append([part, f"{mean:.1f}", f"{most:.1f}", printed])
     _print(
         f"{name}: attention of the action tokens (%), {counted(chunks, 'chunk')} of {source.name}",
@@ -102,10 +105,10 @@ def modulation(args: argparse.Namespace) -> None:
     rows.append(["all", *(f"{mean:.4f} ± {std:.4f}" for mean, std in stats.overall.values())])
     known = _paper("modulation_stats", name)
     if known:
-        printed = [
-            f"{known[f'{part}_mean']} ± {known[f'{part}_std']}" for part in ("scale", "bias")
-        ]
-        rows.append(["paper", *printed])
+        cells = ["paper"]
+        for part in ("scale", "bias"):
+            cells.append(f"{known[f'{part}_mean']} ± {known[f'{part}_std']}")
+        rows.append(cells)
     _print(
         f"{name}: what the modulator predicts, {counted(chunks, 'chunk')} of {source.name}",
         ["layer", "scale", "bias"],
@@ -143,15 +146,16 @@ def recurrence(args: argparse.Namespace) -> None:
     numbers = range(len(source)) if args.episodes is None else args.episodes
     with _rerun(args) as log:
         # before the replays: a file that cannot be written is an error at once
-        episode_curves = [
-            recurrence_curves(policy, source, episode, args.stride) for episode in numbers
-        ]
-        if log is not None:
-            for curves in episode_curves:
-                for i, frame in enumerate(curves.frames.tolist()):
-                    log.views(source, curves.episode, frame)
-                    for key, values in curves.curves.items():
-                        log.number(f"recurrence/{key}", values[i])
+        episode_curves = []
+        for episode in numbers:
+            curves = recurrence_curves(policy, source, episode, args.stride)
+            episode_curves.append(curves)
+            if log is None:
+                continue
+            for i, frame in enumerate(curves.frames.tolist()):
+                log.views(source, curves.episode, frame)
+                for key, values in curves.curves.items():
+                    log.number(f"recurrence/{key}", values[i])
     path = args.output or Path("outputs/analyse") / f"recurrence_{name}.svg"
     table = _beside(path, ".csv")
     require_replaceable(path, ".svg").parent.mkdir(parents=True, exist_ok=True)
@@ -161,18 +165,13 @@ def recurrence(args: argparse.Namespace) -> None:
         writer.writerow(["episode", "frame", *episode_curves[0].curves])
         for curves in episode_curves:
             for i, frame in enumerate(curves.frames):
-                writer.writerow(
-                    [
-                        curves.episode,
-                        frame,
-                        *(f"{values[i]:.6g}" for values in curves.curves.values()),
-                    ]
-                )
-    rows = [
-        [str(c.episode), key, f"{values[0]:.4f}", f"{values[-1]:.4f}", f"{values.mean():.4f}"]
-        for c in episode_curves
-        for key, values in c.curves.items()
-    ]
+                cells = [f"{values[i]:.6g}" for values in curves.curves.values()]
+                writer.writerow([curves.episode, frame, *cells])
+    rows = []
+    for curves in episode_curves:
+        for key, values in curves.curves.items():
+            summary = [f"{x:.4f}" for x in (values[0], values[-1], values.mean())]
+            rows.append([str(curves.episode), key, *summary])
     _print(f"{name} on {source.name}", ["episode", "", "first frame", "last frame", "mean"], rows)
     print(f"wrote {path} and {table}")
 
@@ -219,9 +218,11 @@ def cost(args: argparse.Namespace) -> None:
     from mme_vla.extras.probing.analyses.cost import count_model
 
     known = list(library_files("model"))
-    models = args.models or (
-        ["framesamp_modul", "tokendrop_modul"] if args.budgets is not None else known
-    )
+    models = known
+    if args.models:
+        models = args.models
+    elif args.budgets is not None:
+        models = ["framesamp_modul", "tokendrop_modul"]
     for model in models:
         check_choice("model", model, known)
     if args.budgets is not None:
@@ -234,26 +235,28 @@ def cost(args: argparse.Namespace) -> None:
         for model in models:
             for budget in args.budgets or BUDGETS:
                 counts = count_model(model, budget, args.backbone)
+                flops = [_tera(counts.forward), _tera(counts.chunk)]
                 printed = success.get(budget, {}).get(f"{model}_success", "")
-                rows.append(
-                    [model, f"{budget:,}", _tera(counts.forward), _tera(counts.chunk), printed]
-                )
+                rows.append([model, f"{budget:,}", *flops, printed])
         columns = ["model", "memory tokens", "forward pass", "sampled chunk", "paper's success (%)"]
         return _print("FLOPs over the memory budget", columns, rows)
-    costs = [count_model(model, backbone=args.backbone) for model in models]
-    rows = [
-        [
-            c.model,
-            str(c.prompt),
-            f"{c.parameters / 1e6:,.1f} M",
-            _tera(c.forward),
-            _tera(c.chunk),
-            _tera(c.memory),
-            "" if c.streamed is None else _tera(c.streamed),
-            _tera(c.frames),
-        ]
-        for c in costs
-    ]
+    costs = []
+    rows = []
+    for model in models:
+        counts = count_model(model, backbone=args.backbone)
+        costs.append(counts)
+        rows.append(
+            [
+                counts.model,
+                str(counts.prompt),
+                f"{counts.parameters / 1e6:,.1f} M",
+                _tera(counts.forward),
+                _tera(counts.chunk),
+                _tera(counts.memory),
+                "" if counts.streamed is None else _tera(counts.streamed),
+                _tera(counts.frames),
+            ]
+        )
     columns = [
         "model",
         "prompt",
@@ -290,34 +293,36 @@ def writing(args: argparse.Namespace) -> None:
 
     environment(args.env).check_installed()
     policy: MMEPolicy | None = None
-    selectors: dict[str, Memory | str] = {
-        name: name if name in REFERENCES else _memory(name, args.set) for name in args.memories
-    }
+    selectors: dict[str, Memory | str] = {}
+    for name in args.memories:
+        selectors[name] = name if name in REFERENCES else _memory(name, args.set)
     if args.checkpoint is not None:
         policy = MMEPolicy.from_pretrained(
             resolve_checkpoint(args.checkpoint), trust_plugins=args.trust_plugins
         )
-        selectors[str(PolicySections.of(policy.config).name or args.checkpoint.name)] = (
-            policy.require_memory()
-        )
-    required = [
-        required_frames(memory) for memory in selectors.values() if not isinstance(memory, str)
-    ]
-    rendered = frozenset(frame for frames in required for frame in frames)
+        name = str(PolicySections.of(policy.config).name or args.checkpoint.name)
+        selectors[name] = policy.require_memory()
+    rendered: set[int] = set()
+    for selector in selectors.values():
+        if not isinstance(selector, str):
+            rendered |= required_frames(selector)
     number = int(args.episodes) if args.episodes.isdecimal() else args.episodes
     specs = choose_episodes(args.tasks, number, args.split, args.env)
-    demonstrated = [record_evidence(spec, rendered, args.env) for spec in specs]
-    episodes = [episode for episode in demonstrated if episode is not None]
+    episodes = []
+    for spec in specs:
+        episode = record_evidence(spec, frozenset(rendered), args.env)
+        if episode is not None:
+            episodes.append(episode)
     if len(episodes) < len(specs):
         print(
             f"Left out: {counted(len(specs) - len(episodes), 'episode')} of {len(specs)}. The scene"
             " cannot be built, or the demonstrator did not succeed."
         )
     trained = None if policy is None else policy.memory
-    results = {
-        name: score_writing(selector, episodes, policy if selector is trained else None)
-        for name, selector in selectors.items()
-    }
+    results = {}
+    for name, selector in selectors.items():
+        tower = policy if selector is trained else None
+        results[name] = score_writing(selector, episodes, tower)
     table = writing_table(results)
     print(table)
     if args.output:
@@ -376,7 +381,11 @@ def _paper(table: str, model: str) -> dict[str, str]:
     from mme_vla.evaluation.results.paper import paper_method, paper_table
 
     method = paper_method(model)
-    return next((row for row in paper_table(table) if method and row["method"] == method.name), {})
+    if method is not None:
+        for row in paper_table(table):
+            if row["method"] == method.name:
+                return row
+    return {}
 
 
 def _print(title: str, columns: Sequence[str], rows: list[list[str]]) -> None:

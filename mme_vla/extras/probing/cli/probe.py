@@ -99,12 +99,14 @@ def probe(cfg: DictConfig) -> None:
     try:
         if choice.twins:
             twins = run_twins(policy.eval(), jobs, folder, facts, settings, options)
-            text, page = twins_text(twins), folder / FIGURES
+            text = twins_text(twins)
+            page = folder / FIGURES
         elif choice.card:
             card = run_card(
                 policy.eval(), plan, folder, facts, settings, options, choice.references
             )
-            text, page = card_text(card), folder / PAGE
+            text = card_text(card)
+            page = folder / PAGE
         else:
             page = run_probe(policy.eval(), plan, folder, facts, settings, options).page
             text = (folder / "table.md").read_text(encoding="utf-8")
