@@ -25,7 +25,8 @@ class Standard:
 
     def apply(self, pixels: Tensor) -> Tensor:
         """Standardise [..., 3, s, s]."""
-        mean, std = (pixels.new_tensor(values)[:, None, None] for values in (self.mean, self.std))
+        mean = pixels.new_tensor(self.mean)[:, None, None]
+        std = pixels.new_tensor(self.std)[:, None, None]
         return (pixels - mean) / std
 
 
@@ -65,11 +66,18 @@ class FusedVision(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Six channels [n, 6, s, s] → tokens [n, grid², d_dino + d_siglip]."""
-        towers = (self.dino, self.siglip)
-        return torch.cat(
-            [_patches(tower, x) for tower, x in zip(towers, pixels.split(3, dim=1), strict=True)],
-            dim=-1,
-        )
+        towers: tuple[Any, Any] = (self.dino, self.siglip)
+        read = []
+        for tower, channels in zip(towers, pixels.split(3, dim=1), strict=True):
+            read += tower.forward_intermediates(
+                channels,
+                indices=[len(tower.blocks) - 2],
+                norm=False,
+                stop_early=True,
+                output_fmt="NLC",
+                intermediates_only=True,
+            )
+        return torch.cat(read, dim=-1)
 
 
 def _tower(config: TowerConfig, **options: Any) -> nn.Module:
@@ -85,18 +93,6 @@ def _tower(config: TowerConfig, **options: Any) -> nn.Module:
         norm_layer=partial(nn.LayerNorm, eps=1e-6),
         **options,
     )
-
-
-def _patches(tower: Any, pixels: Tensor) -> Tensor:
-    (tokens,) = tower.forward_intermediates(
-        pixels,
-        indices=[len(tower.blocks) - 2],
-        norm=False,
-        stop_early=True,
-        output_fmt="NLC",
-        intermediates_only=True,
-    )
-    return tokens
 
 
 MAX_POSITIONS = 2048  # Llama 2's; rotary angles know no end, and nothing here depends on it

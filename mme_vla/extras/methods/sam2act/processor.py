@@ -139,10 +139,12 @@ def _render_images(points: Tensor, colours: Tensor, inside: Tensor, side: int) -
     blank = torch.zeros(VIEWS, 7, side, side, device=points.device)
     blank[:, 6] = EMPTY
     nothing = torch.cat([blank, constant_channels(side, points.device)], 1)
-    images = [
-        virtual_images(cloud[mask], paint[mask], side) if mask.any() else nothing
-        for cloud, paint, mask in zip(points, colours, inside, strict=True)
-    ]
+    images = []
+    for cloud, paint, mask in zip(points, colours, inside, strict=True):
+        seen = nothing
+        if mask.any():
+            seen = virtual_images(cloud[mask], paint[mask], side)
+        images.append(seen)
     return torch.stack(images)
 
 
@@ -255,12 +257,9 @@ class SAM2ActProcessor(GoalProcessor):
         for name, value in sizes.items():
             check_integer(f"processor.{name}", value, LARGEST)
         numbers = list(bounds)
-        finite = len(numbers) == 6 and all(
-            isinstance(n, int | float) and np.isfinite(n) for n in numbers
-        )
+        finite = all(isinstance(n, int | float) and np.isfinite(n) for n in numbers)
         require(
-            finite
-            and not any(low >= high for low, high in zip(numbers[:3], numbers[3:], strict=True)),
+            len(numbers) == 6 and finite and np.less(numbers[:3], numbers[3:]).all(),
             f"processor.bounds={brief(numbers)} must be x, y, z of the lowest corner, then the"
             " highest.",
         )
@@ -285,11 +284,8 @@ class SAM2ActProcessor(GoalProcessor):
             HashedTokens(language, words) if text == HASHED else ClipTokens(language, words, text)
         )
         self.side, self.cube = side, Cube.of(numbers)
-        self.trained_waypoints, self.waypoints, self.video_frames = (
-            trained_waypoints,
-            waypoints,
-            video_frames,
-        )
+        self.trained_waypoints, self.waypoints = trained_waypoints, waypoints
+        self.video_frames = video_frames
         self.field_of_view = float(field_of_view)
         self.stats = stats
 
@@ -341,9 +337,8 @@ class SAM2ActProcessor(GoalProcessor):
     def cloud(self, shots: Sequence[Shot]) -> tuple[Tensor, Tensor]:
         """Points [n, 3] in metres, and their colours [n, 3] in [0, 1]."""
         points, colours = cloud_of(shots, self.side)
-        return torch.from_numpy(points), torch.from_numpy(
-            np.ascontiguousarray(colours)
-        ).float() / 255
+        painted = torch.from_numpy(np.ascontiguousarray(colours)).float() / 255
+        return torch.from_numpy(points), painted
 
     def clock(self, place: int, waypoints: int) -> float:
         """Time from 1 down to −1, of the `place`-th of `waypoints` keyframes; it stays at −1 past
@@ -377,15 +372,17 @@ class SAM2ActProcessor(GoalProcessor):
     # Batches
 
     def item(self, sample: Recorded) -> dict[str, Any]:
-        clouds = [cloud_of(shots, self.side) for shots in sample.shots]
-        targets = np.asarray(sample.targets, np.float32)
-        states = []
-        for is_open, place in zip(sample.open, sample.places, strict=True):
+        points, colours, states = [], [], []
+        for shots, is_open, place in zip(sample.shots, sample.open, sample.places, strict=True):
+            places, paint = cloud_of(shots, self.side)
+            points.append(places)
+            colours.append(paint)
             states.append(self.commanded_state(bool(is_open), int(place)))
+        targets = np.asarray(sample.targets, np.float32)
         rotation = Rotation.from_euler("xyz", targets[:, 3:6]).as_quat().astype(np.float32)
         return {
-            "points": torch.from_numpy(np.stack([points for points, _ in clouds])),
-            "colours": torch.from_numpy(np.stack([colours for _, colours in clouds])),
+            "points": torch.from_numpy(np.stack(points)),
+            "colours": torch.from_numpy(np.stack(colours)),
             "state": torch.stack(states),
             "language": self.prompt(sample.goal),
             "target": torch.from_numpy(targets[:, :3]),
