@@ -268,7 +268,7 @@ class InferMessage(BaseModel):
 
     @property
     def subgoals(self) -> dict[str, str]:
-        texts = {kind: getattr(self, kind) for kind in SUBGOALS}
+        texts = {"simple_subgoal": self.simple_subgoal, "grounded_subgoal": self.grounded_subgoal}
         return {kind: text for kind, text in texts.items() if text is not None}
 
 

@@ -87,8 +87,8 @@ def _tower(config: TowerConfig, **options: Any) -> nn.Module:
         embed_dim=config.width,
         depth=config.depth,
         num_heads=config.num_heads,
-        mlp_ratio=(config.mlp_dim + 0.5)
-        / config.width,  # timm truncates the product: aim at the middle
+        # timm truncates the product: aim at the middle
+        mlp_ratio=(config.mlp_dim + 0.5) / config.width,
         num_classes=0,
         norm_layer=partial(nn.LayerNorm, eps=1e-6),
         **options,

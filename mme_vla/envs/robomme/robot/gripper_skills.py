@@ -73,7 +73,8 @@ def failing_offset(mode: str, distance: float, seed: int) -> np.ndarray:
     """
     if mode == "z":
         return np.array([0.0, 0.0, distance])
-    draws, signs = Draws(seed), (0, 0)
+    draws = Draws(seed)
+    signs = (0, 0)
     while signs == (0, 0):
         signs = (draws.integer(-1, 2), draws.integer(-1, 2))
     return distance * np.array([*signs, 0.0])

@@ -39,10 +39,8 @@ def shadow_of_smallest_box(
         Centre [2], the two axes [2, 2], one a row, of length one or, where upright, zero, and half
         the widths [2].
     """
-    points, triangles = (
-        np.frombuffer(vertices).reshape(-1, 3),
-        np.frombuffer(faces, np.int64).reshape(-1, 3),
-    )
+    points = np.frombuffer(vertices).reshape(-1, 3)
+    triangles = np.frombuffer(faces, np.int64).reshape(-1, 3)
     rotation, widths = smallest_box(Trimesh(points, triangles, process=False))
     corners = matrix_product(rotation, points.T)
     middle = corners.min(axis=1) + np.ptp(corners, axis=1) * 0.5
@@ -130,9 +128,9 @@ def _unit_edges(ends: np.ndarray) -> np.ndarray:
 def _widths_along(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Widths [m, 2] of points [n, 2] along each of the directions [m, 2] and across it."""
     across = np.column_stack((-edges[:, 1], edges[:, 0]))
-    return np.column_stack(
-        [np.ptp(matrix_product(axes, points.T), axis=1) for axes in (edges, across)]
-    )
+    lengths = np.ptp(matrix_product(edges, points.T), axis=1)
+    widths = np.ptp(matrix_product(across, points.T), axis=1)
+    return np.column_stack([lengths, widths])
 
 
 def _smallest_rectangle(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

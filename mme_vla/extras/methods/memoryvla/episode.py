@@ -125,5 +125,3 @@ def _bank(entries: Sequence[tuple[int, Tensor]], like: BankState) -> BankState:
         return BankState(like.entries[:0], like.times[:0])
     times, contents = zip(*entries, strict=True)
     return BankState(torch.stack(contents), like.times.new_tensor(times))
-
-

@@ -208,6 +208,7 @@ class MultiViewTransformer(nn.Module):
         tokens = self.narrow(x[:, words:]).reshape(batch * VIEWS, grid**2, -1)
         return tokens.transpose(1, 2).unflatten(-1, (grid, grid))
 
+
 class HeatmapDecoder(nn.Module):
     """Patch tokens and the encoder's finer maps → heatmap logits at the images' size."""
 
