@@ -233,7 +233,6 @@ def _shaped(*shape: int | None) -> Any:
 
 # Messages.
 
-SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}
 """openpi's names of RoboMME's cameras."""
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")

@@ -57,13 +57,6 @@ class FusedVision(nn.Module):
         self.siglip = _tower(config.siglip, global_pool="map", class_token=False, **size)
         self.dino_standard = dino_standard
 
-    def standardised(self, images: Tensor) -> Tensor:
-        """Images [..., 3, s, s] in [−1, 1] → six channels [..., 6, s, s]: DINOv2's,
-        then SigLIP's.
-        """
-        pixels = (images + 1) / 2
-        return torch.cat([self.dino_standard.apply(pixels), HALF.apply(pixels)], dim=-3)
-
     def forward(self, pixels: Tensor) -> Tensor:
         """Six channels [n, 6, s, s] → tokens [n, grid², d_dino + d_siglip]."""
         towers: tuple[Any, Any] = (self.dino, self.siglip)
@@ -139,8 +132,11 @@ class Prismatic(nn.Module):
         nothing learns.
         """
         frozen = not any(p.requires_grad for p in self.vision.parameters())
+        pixels = (images + 1) / 2
+        # DINOv2's three channels, then SigLIP's
+        channels = torch.cat([self.vision.dino_standard.apply(pixels), HALF.apply(pixels)], dim=-3)
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
-            return self.vision(self.vision.standardised(images))
+            return self.vision(channels)
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
         """Fused tokens [n, grid², d_vision] as memories store them."""

@@ -156,7 +156,7 @@ class GripperPrimitives(RobotControl):
         if close:
             self.announce(above, CLOSE)
             self.close()
-        self.move_to(self._over(button, button.base_z, DOWNWARD_Q), CLOSE)
+        self.move_to(self._over(button, float(button.pose.p[2]), DOWNWARD_Q), CLOSE)
         self.move_to(above, CLOSE)
 
     def hover(self, button: Button) -> None:

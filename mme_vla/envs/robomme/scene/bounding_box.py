@@ -60,10 +60,13 @@ def smallest_box(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
     hull = mesh.convex_hull
     vertices = np.asarray(hull.vertices, np.float64)
     normals = np.asarray(hull.face_normals, np.float64)
-    least, upright = math.inf, np.eye(3)
+    least = math.inf
+    upright = np.eye(3)
     for azimuth, inclination in _directions(normals):
         turn = _turn_to_vertical(azimuth, inclination)
-        visible = _along(normals, turn[2]) > -_SHORTEST_EDGE
+        up = turn[2]
+        heights = normals[:, 0] * up[0] + normals[:, 1] * up[1] + normals[:, 2] * up[2]
+        visible = heights > -_SHORTEST_EDGE
         if not visible.any():
             continue
         # The outline seen from this direction: edges of which one face is visible and the other is
@@ -106,13 +109,6 @@ def _turn_to_vertical(azimuth: float, inclination: float) -> np.ndarray:
         [-sin_a, cos_a, 0.0],
         [sin_i * cos_a, sin_i * sin_a, cos_i],
     ])  # fmt: skip
-
-
-def _along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Components [n] of vectors [n, 3] along a direction [3]."""
-    return (
-        vectors[:, 0] * direction[0] + vectors[:, 1] * direction[1] + vectors[:, 2] * direction[2]
-    )
 
 
 def _unit_edges(ends: np.ndarray) -> np.ndarray:

@@ -103,13 +103,6 @@ def build_image_encoder() -> nn.Sequential:
     return nn.Sequential(*list(resnet18(weights=None, norm_layer=norm).children())[:8])
 
 
-def map_size(side: int) -> int:
-    """Cells of the encoder's map along a side of so many pixels: halved five times, rounded up."""
-    for _ in range(5):
-        side = -(-side // 2)
-    return side
-
-
 def cell_centres(height: int, width: int, device: torch.device | None = None) -> Tensor:
     """(x, y) of each cell of a map in [−1, 1], row by row: [height·width, 2]."""
     y, x = torch.meshgrid(

@@ -3,6 +3,7 @@ beside them.
 """
 
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.extras.methods.diffusion_policy.model import cell_centres, map_size
+from mme_vla.extras.methods.diffusion_policy.model import cell_centres
 from mme_vla.extras.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import cast
@@ -62,7 +63,8 @@ def diffusion_adapter(policy: Policy) -> Adapter:
     for name in policy.state_dict():
         if policy.finetune_spec.component_of(name) not in ("memory", "vision"):
             table[name] = [Piece(name.replace(_LOCAL, _UNET).removeprefix("backbone."))]
-    height, width = (map_size(side) for side in policy.sizes.cropped)
+    # The image encoder halves an image five times, rounding up.
+    height, width = (math.ceil(side / 32) for side in policy.sizes.cropped)
     return Adapter(table, derived=[Derived(_GRID, partial(cell_centres, height, width))])
 
 

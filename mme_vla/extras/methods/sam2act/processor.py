@@ -29,7 +29,7 @@ from mme_vla.extras.methods.sam2act.geometry import (
     virtual_images,
 )
 from mme_vla.processing.base import STATS_FILE, SampleSpec
-from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import TensorStruct
 
@@ -302,7 +302,7 @@ class SAM2ActProcessor(GoalProcessor):
     def require_stats(self) -> NormStats:
         """Statistics that change nothing, where none were computed: this policy reads none."""
         robot = self.embodiment
-        return self._stats or NormStats(_neutral(robot.state.width), _neutral(robot.action.width))
+        return self._stats or NormStats.unit(robot.state.width, robot.action.width)
 
     # Observations
 
@@ -353,12 +353,6 @@ class SAM2ActProcessor(GoalProcessor):
             [opened, finger, finger, self.clock(place, self.waypoints)], dtype=torch.float32
         )
 
-    def commanded_state(self, opened: bool, place: int) -> Tensor:
-        """The same in training, where fingers are synthetic from the command, as released."""
-        finger = FINGER_OPEN if opened else 0.0
-        clock = self.clock(place, self.trained_waypoints)
-        return torch.tensor([float(opened), finger, finger, clock], dtype=torch.float32)
-
     # Actions
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
@@ -377,13 +371,17 @@ class SAM2ActProcessor(GoalProcessor):
             places, paint = cloud_of(shots, self.side)
             points.append(places)
             colours.append(paint)
-            states.append(self.commanded_state(bool(is_open), int(place)))
+            # As `state`, but for the fingers: in training they are synthetic from the command, as
+            # released.
+            finger = FINGER_OPEN if is_open else 0.0
+            clock = self.clock(int(place), self.trained_waypoints)
+            states.append([float(is_open), finger, finger, clock])
         targets = np.asarray(sample.targets, np.float32)
         rotation = Rotation.from_euler("xyz", targets[:, 3:6]).as_quat().astype(np.float32)
         return {
             "points": torch.from_numpy(np.stack(points)),
             "colours": torch.from_numpy(np.stack(colours)),
-            "state": torch.stack(states),
+            "state": torch.tensor(states, dtype=torch.float32),
             "language": self.prompt(sample.goal),
             "target": torch.from_numpy(targets[:, :3]),
             "rotation": torch.from_numpy(rotation),
@@ -415,8 +413,3 @@ class SAM2ActProcessor(GoalProcessor):
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
         }
-
-
-def _neutral(width: int) -> QuantileStats:
-    zeros, ones = np.zeros(width), np.ones(width)
-    return QuantileStats(mean=zeros, std=ones, q01=-ones, q99=ones.copy())
