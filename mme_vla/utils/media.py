@@ -113,6 +113,14 @@ def png_bytes(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
+def bordered(image: np.ndarray) -> np.ndarray:
+    """The image in a red border: it belongs to a conditioning video."""
+    framed = image.copy()
+    for edge in (np.s_[:BORDER], np.s_[-BORDER:], np.s_[:, :BORDER], np.s_[:, -BORDER:]):
+        framed[edge] = RED
+    return framed
+
+
 def video_frame(
     views: Sequence[np.ndarray], caption: str | None = None, video: bool = False
 ) -> np.ndarray:
