@@ -477,8 +477,8 @@ class JointTransformer(nn.Module):
         once, not m times.
         """
         *of_layers, final = (norm.modulation(condition) for norm in self.time_norms())
-        pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
-        return TimeModulations([LayerTimeModulation(*pair) for pair in pairs], final)
+        layers = map(LayerTimeModulation, of_layers[::2], of_layers[1::2])
+        return TimeModulations(list(layers), final)
 
     def time_norms(self) -> list[AdaRMSNorm]:
         """The norms that a condition modulates: two of every layer, and the final one."""

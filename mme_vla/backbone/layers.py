@@ -173,15 +173,6 @@ class Span(NamedTuple):
     length: int
 
 
-def visible_blocks(name: str, table: Visibility) -> frozenset[str] | set[str]:
-    """The blocks that a block of this name attends to."""
-    if name not in table:
-        raise UserError(
-            f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}."
-        )
-    return table[name]
-
-
 def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
     """Rotary positions [b, n]: valid tokens are counted, padding repeats the number before it (−1
     first).
@@ -201,20 +192,22 @@ def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
     if all(block.positions is None for block in blocks):
         return numbered
     parts = numbered.float().split([len(block) for block in blocks], 1)
-    positions = [
-        part if block.positions is None else block.positions
-        for part, block in zip(parts, blocks, strict=True)
-    ]
-    counts = {part.shape[-1] for part in positions if part.ndim == 3}
+    positions = []
+    counts = set()
+    for counted, block in zip(parts, blocks, strict=True):
+        part = counted if block.positions is None else block.positions
+        positions.append(part)
+        if part.ndim == 3:
+            counts.add(part.shape[-1])
     if len(counts) > 1:
         raise ValueError(
             f"Blocks have positions of {sorted(counts)} coordinates: all need as many, or one"
             " number."
         )
     for count in counts:
-        positions = [
-            part if part.ndim == 3 else part[..., None].expand(-1, -1, count) for part in positions
-        ]
+        for i, part in enumerate(positions):
+            if part.ndim == 2:
+                positions[i] = part[..., None].expand(-1, -1, count)
     return torch.cat(positions, 1)
 
 
@@ -244,7 +237,12 @@ class MaskLayout(NamedTuple):
         """
         runs: list[tuple[int, list[bool]]] = []
         for query in queries:
-            sees = [key.name in visible_blocks(query.name, table) for key in keys]
+            if query.name not in table:
+                raise UserError(
+                    f"Block {query.name!r} has no row in the visibility table; it has rows"
+                    f" {sorted(table)}."
+                )
+            sees = [key.name in table[query.name] for key in keys]
             if runs and runs[-1][1] == sees:
                 runs[-1] = (runs[-1][0] + query.length, sees)
             else:
@@ -265,7 +263,8 @@ class MaskLayout(NamedTuple):
 
     def part(self, rows: Sequence[slice]) -> "MaskLayout":
         """The layout of some of the queries, ranges of their indices in order."""
-        lengths, runs, start = [], [], 0
+        lengths, runs = [], []
+        start = 0
         for run, length in enumerate(self.lengths):
             count = 0
             for at in rows:
@@ -281,9 +280,9 @@ class MaskLayout(NamedTuple):
 
     def expand(self, rows: Tensor) -> Tensor:
         """Values of each run [b, runs, k] for each query [b, n, k]: a view if there is one run."""
-        parts = [
-            rows[:, run, None].expand(-1, length, -1) for run, length in enumerate(self.lengths)
-        ]
+        parts = []
+        for run, length in enumerate(self.lengths):
+            parts.append(rows[:, run, None].expand(-1, length, -1))
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 

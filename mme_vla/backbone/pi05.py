@@ -229,9 +229,9 @@ class Pi05Backbone(
             modulations = self.time_modulations(len(times))
         else:  # memory changes the condition of each sample: every time for each
             rows = len(x)
-            changed = [
-                injection.condition(time.expand(rows, -1)) for time in self.time_condition(times)
-            ]
+            changed = []
+            for time in self.time_condition(times):
+                changed.append(injection.condition(time.expand(rows, -1)))
             modulations = self.transformer.time_modulations(torch.cat(changed))
 
         def predict_at(x_t: Tensor, index: int) -> Tensor:

@@ -28,8 +28,8 @@ class VisionTower(nn.Module):
             embed_dim=config.width,
             depth=config.depth,
             num_heads=config.num_heads,
-            mlp_ratio=(config.mlp_dim + 0.5)
-            / config.width,  # timm truncates the product: aim at the middle
+            # timm truncates the product: aim at the middle
+            mlp_ratio=(config.mlp_dim + 0.5) / config.width,
             num_classes=output_dim,
             class_token=False,
             global_pool="",
@@ -54,12 +54,12 @@ class VisionTower(nn.Module):
             every: see `PastViews`.
         """
         vit: Any = self.vit
-        clips, images = images.shape[:-3], images.flatten(0, -4)
+        clips = images.shape[:-3]
+        images = images.flatten(0, -4)
         convolution = vit.patch_embed.proj
         # Patches and positions in float32, as released; then the compute dtype.
-        with torch.autocast(
-            images.device.type if images.device.type != "meta" else "cpu", enabled=False
-        ):
+        kind = images.device.type if images.device.type != "meta" else "cpu"
+        with torch.autocast(kind, enabled=False):
             weight, bias = convolution.weight.float(), convolution.bias.float()
             patches = nn.functional.conv2d(images.float(), weight, bias, stride=convolution.stride)
             x = patches.flatten(2).transpose(1, 2) + vit.pos_embed.float()

@@ -155,10 +155,10 @@ class Environment(ABC):
         self.check_task(task)
         self.check_split(split)
         first = _FIRST_SEED.get(split, _OTHER_SPLITS)
-        return [
-            EpisodeSpec(task, split, number, first + number, "")
-            for number in range(self.splits[split])
-        ]
+        specs = []
+        for number in range(self.splits[split]):
+            specs.append(EpisodeSpec(task, split, number, first + number, ""))
+        return specs
 
     # What commands call ---------------------------------------------------------------------------
 
@@ -372,9 +372,7 @@ class EpisodeEnv:
         observation, info = self._begin()
         values = self.environment.scene_values(self.env)
         self.scene_digest = NO_VALUES if values is None else scene_digest(values)
-        frames = []
-        for first, is_current in self._first_observations(observation, info):
-            frames.append(self._read_frame(first, is_current))
+        frames = list(self._first_frames(observation, info))
         return self._lists(frames), self._info(info, False, False)
 
     def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:
@@ -458,10 +456,7 @@ class EpisodeEnv:
         """
         observation, info = self._begin()
         self.success = False
-        frames = []
-        for first, is_current in self._first_observations(observation, info):
-            frames.append(self._read_frame(first, is_current))
-        *video, frame = frames
+        *video, frame = self._first_frames(observation, info)
         actions = self.environment.demonstrate(self.env)
         action: Any = next(actions, None)
         require(action is not None, f"{self.spec.task}: the demonstrator gives no action.")
@@ -503,24 +498,22 @@ class EpisodeEnv:
             terminated = True
         return observation, reward, terminated, truncated, info
 
-    def _first_observations(
+    def _first_frames(
         self, observation: Mapping[str, Any], info: Mapping[str, Any]
-    ) -> Iterator[tuple[Mapping[str, Any], bool]]:
-        """The observations of the conditioning video and the current one, each to be read before
-        the next, and whether it is the current one.
-        """
+    ) -> Iterator[dict[str, Any]]:
+        """The frames of the conditioning video, each read before the next, and the current one."""
         for earlier in info.get("video", ()):
-            yield earlier, False
+            yield self._read_frame(earlier)
         if self.environment.cue == "video":
             for _ in range(int(info.get("frozen", 0))):
-                yield observation, False
+                yield self._read_frame(observation)
                 observation, _, terminated, truncated, _ = self._perform(self.hold_action)
                 require(
                     not (terminated or truncated),
                     f"{self.spec.task}: the episode ended within the {info['frozen']} steps of"
                     " info['frozen'], before a policy could act.",
                 )
-        yield observation, True
+        yield self._read_frame(observation, newest=True)
 
     def _read_frame(self, observation: Mapping[str, Any], newest: bool = False) -> dict[str, Any]:
         """An observation with its images: those that are functions are rendered now, or left

@@ -108,7 +108,9 @@ class FactLog:
             if self._extend(name, current.value):
                 continue
             if current.replaces:
-                self._mark_changed(current.subjects)
+                for i, fact in enumerate(self.facts):
+                    if fact.changed is None and self._subjects[i] & current.subjects:
+                        self.facts[i] = replace(fact, changed=frame)
             self.facts.append(Fact(name, current.value, (frame, frame)))
             self._subjects.append(current.subjects)
         if decides:
@@ -123,11 +125,6 @@ class FactLog:
                 self.facts[i] = replace(fact, frames=(first, self.n_frames))
                 return True
         return False
-
-    def _mark_changed(self, subjects: Set[str]) -> None:
-        for i, fact in enumerate(self.facts):
-            if fact.changed is None and self._subjects[i] & subjects:
-                self.facts[i] = replace(fact, changed=self.n_frames)
 
 
 class TaskFacts:

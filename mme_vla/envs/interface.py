@@ -414,7 +414,8 @@ class RoboMMEEnv(gymnasium.Env):
             self.on_frame(frame, run.info, run.in_video)
 
     def _step_control(self, action: np.ndarray) -> None:
-        task, run = self.task, self._require_run()
+        task = self.task
+        run = self._require_run()
         run.count += not run.in_video
         # A frame has the text of the sub-task in which its step was made, not of the next one. In
         # the video it has the text of the demonstrated sub-task where one of the two has none.
@@ -478,14 +479,15 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _options(self) -> list[dict[str, Any]]:
         """What the task offers to choose from."""
-        choices = self.task.choices()
-        options = [choice.option.to_dict() for choice in choices]
-        if self.include.possible:
-            possible = [self._is_possible(choice) for choice in choices]
-            if not any(possible):  # something has to be chosen
-                possible = [True] * len(choices)
-            for option, flag in zip(options, possible, strict=True):
-                option["possible"] = flag
+        options = []
+        for choice in self.task.choices():
+            option = choice.option.to_dict()
+            if self.include.possible:
+                option["possible"] = self._is_possible(choice)
+            options.append(option)
+        if self.include.possible and not any(option["possible"] for option in options):
+            for option in options:  # something has to be chosen
+                option["possible"] = True
         return options
 
     def _is_possible(self, choice: "Choice") -> bool:

@@ -1,5 +1,6 @@
 """`make_env`: one benchmark episode as an environment, in one line."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
@@ -141,10 +142,9 @@ def load_tasks(*tasks: str) -> None:
     >>> gymnasium.make("StopCube", seed=0, difficulty="easy", obs_mode="rgb")  # doctest: +SKIP
     """
     require_simulator()
-    from mme_vla.envs.robomme.tasks import module_name
-
     for task in tasks or TASK_NAMES:
-        import_module(f"mme_vla.envs.robomme.tasks.{module_name(task)}")
+        module = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", task).lower()  # `pick_xtimes` of `PickXtimes`
+        import_module(f"mme_vla.envs.robomme.tasks.{module}")
 
 
 def make_task(

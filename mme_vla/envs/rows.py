@@ -69,7 +69,7 @@ def rows_of(task: str, split: str, known: tuple[str, ...]) -> list[Row]:
 @cache
 def _ood() -> dict[str, list[Row]]:
     packed = files("mme_vla").joinpath("assets", "robomme_metadata", "ood.jsonl.xz").read_bytes()
-    return _by_task(json.loads(line) for line in lzma.decompress(packed).decode().splitlines())
+    return _by_task(map(json.loads, lzma.decompress(packed).decode().splitlines()))
 
 
 @cache

@@ -43,9 +43,13 @@ def key_pose(subtask: SubTask) -> VisibleFact:
 
 def candidates_among(things: Sequence[Thing], correct: Sequence[Thing]) -> Candidates:
     """Things as candidates, those that are also in `correct` as the correct ones."""
-    numbers = {id(thing) for thing in correct}
-    indices = [i for i, thing in enumerate(things) if id(thing) in numbers]
-    return Candidates([thing.position[:2].tolist() for thing in things], indices)
+    numbers = set(map(id, correct))
+    places, indices = [], []
+    for i, thing in enumerate(things):
+        places.append(thing.position[:2].tolist())
+        if id(thing) in numbers:
+            indices.append(i)
+    return Candidates(places, indices)
 
 
 class Task(Stage):

@@ -192,14 +192,16 @@ def past_views(
 
 def stack_past(items: Sequence[PastViews | None]) -> PastViews | None:
     """Unbatched past views as those of a batch; None where there are none."""
-    present = [item for item in items if item is not None]
-    if not present:
+    images, masks = [], []
+    every = 0
+    for item in items:
+        if item is not None:
+            images.append(item.images)
+            masks.append(item.mask)
+            every = item.every
+    if not images:
         return None
-    return PastViews(
-        torch.stack([item.images for item in present]),
-        torch.stack([item.mask for item in present]),
-        present[0].every,
-    )
+    return PastViews(torch.stack(images), torch.stack(masks), every)
 
 
 def full_past(

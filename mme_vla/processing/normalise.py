@@ -49,8 +49,12 @@ class QuantileStats:
 
     def to_dict(self) -> dict[str, list[float]]:
         """Return plain lists, as `norm_stats.json` holds them."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value.tolist() for name, value in values.items() if value is not None}
+        lists = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None:
+                lists[field.name] = value.tolist()
+        return lists
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], name: str = "statistics") -> Self:

@@ -86,22 +86,6 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
     return settings
 
 
-def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
-    """Read `processor.json` of a checkpoint; check that its files are in the folder, and their
-    checksums.
-
-    Args:
-        tokenizer: in place of the one it names.
-    """
-    config = read_settings(folder)
-    if tokenizer is None:
-        tokenizer = saved_tokenizer(folder, config.get("tokenizer", ""))
-    stats = config.get("stats")
-    if stats is not None:
-        stats = saved_file(folder, stats, "statistics")
-    return {**config, "tokenizer": tokenizer, "stats": stats}
-
-
 def saved_file(folder: Path, name: Any, what: str) -> Path:
     """The path of a file that a checkpoint names in itself; where the folder has checksums, it must
     have one.
@@ -394,11 +378,18 @@ class Processor(PolicyProcessor):
             tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes
                 it.
         """
-        config = saved_settings(Path(folder), tokenizer)
+        folder = Path(folder)
+        config = read_settings(folder)
+        # Its files are in the folder, and have their checksums.
+        if tokenizer is None:
+            tokenizer = saved_tokenizer(folder, config.get("tokenizer", ""))
+        stats = config.get("stats")
+        if stats is not None:
+            stats = saved_file(folder, stats, "statistics")
         try:
-            return cls.from_config(config)
+            return cls.from_config({**config, "tokenizer": tokenizer, "stats": stats})
         except UserError as error:
-            raise UserError(f"{Path(folder) / CONFIG_FILE}: {error}") from None
+            raise UserError(f"{folder / CONFIG_FILE}: {error}") from None
 
 
 def _float(x: np.ndarray | Tensor) -> Tensor:

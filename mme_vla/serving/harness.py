@@ -166,9 +166,9 @@ class MMEVLAModelServer(PredictModelServer):
         self, obs_batch: list[dict[str, Any]], ctx_batch: list[SessionContext]
     ) -> list[dict[str, np.ndarray]]:
         """Choose the chunks of these sessions in one batch."""
-        episodes = [
-            self._caught_up(obs, ctx) for obs, ctx in zip(obs_batch, ctx_batch, strict=True)
-        ]
+        episodes = []
+        for obs, ctx in zip(obs_batch, ctx_batch, strict=True):
+            episodes.append(self._caught_up(obs, ctx))
         return [{"actions": chunk} for chunk in self.policy.act(episodes, self.flow_steps)]
 
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:

@@ -233,7 +233,6 @@ def _shaped(*shape: int | None) -> Any:
 
 # Messages.
 
-SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}
 """openpi's names of RoboMME's cameras."""
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
@@ -268,7 +267,7 @@ class InferMessage(BaseModel):
 
     @property
     def subgoals(self) -> dict[str, str]:
-        texts = {kind: getattr(self, kind) for kind in SUBGOALS}
+        texts = {"simple_subgoal": self.simple_subgoal, "grounded_subgoal": self.grounded_subgoal}
         return {kind: text for kind, text in texts.items() if text is not None}
 
 

@@ -35,9 +35,8 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
     there of other files stay.
     """
     if names is None:
-        names = [
-            path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
-        ]
+        found = filter(Path.is_file, folder.rglob("*"))
+        names = [path.relative_to(folder).as_posix() for path in found]
     files = sorted(set(names) - {SUMS})
     table: dict[str, str] = {}
     if keep and (folder / SUMS).exists():

@@ -105,9 +105,10 @@ def _descriptions(kind: Any) -> dict[str, str]:
     """What each key of a model means, by the name that the outside uses."""
     if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
         return dict.fromkeys(getattr(kind, "__dataclass_fields__", {}), "")
-    return {
-        field.alias or name: field.description or "" for name, field in kind.model_fields.items()
-    }
+    meanings = {}
+    for name, field in kind.model_fields.items():
+        meanings[field.alias or name] = field.description or ""
+    return meanings
 
 
 def described(value: object) -> str:

@@ -95,7 +95,7 @@ def test_a_pressed_button_springs_back(everything):
     assert button.depth < 0.001
     button.articulation.set_qpos(np.array([[-0.01]], np.float32))
     button.restore()
-    assert button.depth == 0 and button.base_z == pytest.approx(0.0075)
+    assert button.depth == 0 and button.pose.p[2] == pytest.approx(0.0075)
 
 
 @pytest.mark.slow

@@ -157,7 +157,10 @@ def serve(connection: Any, block: Any, factory: Callable[..., Any]) -> None:
 
 def _portable(error: Exception) -> Exception:
     """The error, or a RuntimeError of its text if the reader would have to import its class."""
-    place = _plugin_line(error)
+    place = None  # the innermost code of a plugin that the error passed
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if _is_of_plugin(frame):
+            place = f"{frame.f_code.co_filename}, line {line}"
     portable: Exception = RuntimeError(f"{type(error).__name__}: {error}")
     if type(error).__module__ in ("builtins", errors.__name__):
         try:
@@ -168,15 +171,6 @@ def _portable(error: Exception) -> Exception:
     if place is not None and not isinstance(error, errors.UserError | errors.SceneError):
         errors.set_place(portable, f"{type(error).__name__}, {place}")
     return portable
-
-
-def _plugin_line(error: Exception) -> str | None:
-    """File and line of the innermost code of a plugin that an error passed, if it passed any."""
-    place = None
-    for frame, line in traceback.walk_tb(error.__traceback__):
-        if _is_of_plugin(frame):
-            place = f"{frame.f_code.co_filename}, line {line}"
-    return place
 
 
 def _is_of_plugin(frame: FrameType) -> bool:

@@ -25,7 +25,8 @@ class Standard:
 
     def apply(self, pixels: Tensor) -> Tensor:
         """Standardise [..., 3, s, s]."""
-        mean, std = (pixels.new_tensor(values)[:, None, None] for values in (self.mean, self.std))
+        mean = pixels.new_tensor(self.mean)[:, None, None]
+        std = pixels.new_tensor(self.std)[:, None, None]
         return (pixels - mean) / std
 
 
@@ -56,20 +57,20 @@ class FusedVision(nn.Module):
         self.siglip = _tower(config.siglip, global_pool="map", class_token=False, **size)
         self.dino_standard = dino_standard
 
-    def standardised(self, images: Tensor) -> Tensor:
-        """Images [..., 3, s, s] in [−1, 1] → six channels [..., 6, s, s]: DINOv2's,
-        then SigLIP's.
-        """
-        pixels = (images + 1) / 2
-        return torch.cat([self.dino_standard.apply(pixels), HALF.apply(pixels)], dim=-3)
-
     def forward(self, pixels: Tensor) -> Tensor:
         """Six channels [n, 6, s, s] → tokens [n, grid², d_dino + d_siglip]."""
-        towers = (self.dino, self.siglip)
-        return torch.cat(
-            [_patches(tower, x) for tower, x in zip(towers, pixels.split(3, dim=1), strict=True)],
-            dim=-1,
-        )
+        towers: tuple[Any, Any] = (self.dino, self.siglip)
+        read = []
+        for tower, channels in zip(towers, pixels.split(3, dim=1), strict=True):
+            read += tower.forward_intermediates(
+                channels,
+                indices=[len(tower.blocks) - 2],
+                norm=False,
+                stop_early=True,
+                output_fmt="NLC",
+                intermediates_only=True,
+            )
+        return torch.cat(read, dim=-1)
 
 
 def _tower(config: TowerConfig, **options: Any) -> nn.Module:
@@ -79,24 +80,12 @@ def _tower(config: TowerConfig, **options: Any) -> nn.Module:
         embed_dim=config.width,
         depth=config.depth,
         num_heads=config.num_heads,
-        mlp_ratio=(config.mlp_dim + 0.5)
-        / config.width,  # timm truncates the product: aim at the middle
+        # timm truncates the product: aim at the middle
+        mlp_ratio=(config.mlp_dim + 0.5) / config.width,
         num_classes=0,
         norm_layer=partial(nn.LayerNorm, eps=1e-6),
         **options,
     )
-
-
-def _patches(tower: Any, pixels: Tensor) -> Tensor:
-    (tokens,) = tower.forward_intermediates(
-        pixels,
-        indices=[len(tower.blocks) - 2],
-        norm=False,
-        stop_early=True,
-        output_fmt="NLC",
-        intermediates_only=True,
-    )
-    return tokens
 
 
 MAX_POSITIONS = 2048  # Llama 2's; rotary angles know no end, and nothing here depends on it
@@ -143,8 +132,11 @@ class Prismatic(nn.Module):
         nothing learns.
         """
         frozen = not any(p.requires_grad for p in self.vision.parameters())
+        pixels = (images + 1) / 2
+        # DINOv2's three channels, then SigLIP's
+        channels = torch.cat([self.vision.dino_standard.apply(pixels), HALF.apply(pixels)], dim=-3)
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
-            return self.vision(self.vision.standardised(images))
+            return self.vision(channels)
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
         """Fused tokens [n, grid², d_vision] as memories store them."""

@@ -120,8 +120,9 @@ class RemoteEpisode(Episode):
 
     def take_frames(self) -> NewFrames:
         """What was observed since the last chunk; it is not held any longer."""
+        require(self._states, "A served policy needs a new frame before each chunk.")
         views = {}
-        for name in self._views[0] if self._views else ():
+        for name in self._views[0]:
             parts = [part[name] for part in self._views]
             # A part without frames, of a choice that moved nothing, has no size of its own.
             views[name] = np.concatenate([part for part in parts if len(part)] or parts[:1])
@@ -146,10 +147,6 @@ class RemoteEpisode(Episode):
         self._n_video = 0
         self._leading = []
         return frames
-
-    @property
-    def has_frames(self) -> bool:
-        return bool(self._states)
 
     @property
     def failure(self) -> Failure | None:
@@ -345,7 +342,6 @@ class RemotePolicy(Policy):
         """The next chunk [h, w] of an episode; None after a failure."""
         if episode.failure is not None:
             return None
-        require(episode.has_frames, "A served policy needs a new frame before each chunk.")
         frames = episode.take_frames()
         try:
             if episode.connection is None:

@@ -11,6 +11,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, get_args
 
 import numpy as np
@@ -201,7 +202,14 @@ class ChallengeProtocol(ServerProtocol):
     executes_all = True
 
     def check(self) -> None:
-        _check_benchmark(self)
+        robot = self.robot
+        require(
+            robot.action.space is not None
+            and robot.state.width == ARM_JOINTS + 1
+            and set(robot.camera_names) <= set(CAMERAS),
+            f"The robot {robot.name!r} is not the benchmark's, and protocol={self.name} has no"
+            " place for its observations.",
+        )
 
     def open(self) -> Connection:
         connection = self.choice.connection
@@ -354,18 +362,13 @@ def detect(choice: ServerChoice) -> Detection:
     if choice.is_http:
         return Detection("challenge", "it has HTTP")
 
-    def open_briefly() -> Connection:
-        seconds = min(STARTUP_S, connection.open_s)
-        return open_websocket(choice.server, connection.api_key, connection.timeout_s, seconds)
-
     # All but the harness's servers send their metadata first.
+    address = (choice.server, connection.api_key, connection.timeout_s)
+    briefly = min(STARTUP_S, connection.open_s)
     try:
-        client = open_patiently(open_briefly, connection.open_s)
+        client = open_patiently(partial(open_websocket, *address, briefly), connection.open_s)
     except TimeoutError:
-        harness = HarnessConnection(
-            choice.server, connection.api_key, connection.timeout_s, connection.open_s
-        )
-        harness.close()
+        HarnessConnection(*address, connection.open_s).close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
         if str(client.metadata.get("server")) == SERVER_NAME:
@@ -391,17 +394,6 @@ def _lists(robot: Embodiment, frames: NewFrames) -> dict[str, Any]:
     for name in robot.readings:
         lists[f"{name}_list"] = list(frames.views[name])
     return lists
-
-
-def _check_benchmark(protocol: ServerProtocol) -> None:
-    robot = protocol.robot
-    require(
-        robot.action.space is not None
-        and robot.state.width == ARM_JOINTS + 1
-        and set(robot.camera_names) <= set(CAMERAS),
-        f"The robot {robot.name!r} is not the benchmark's, and protocol={protocol.name} has no"
-        " place for its observations.",
-    )
 
 
 def _subgoal_kind(text: str) -> str:

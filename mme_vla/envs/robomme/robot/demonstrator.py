@@ -81,7 +81,10 @@ class PegPrimitives(RobotControl):
         """
         self.open()
         grasp = _peg_grasp(getattr(peg, end), flip)
-        self._reversed = bool(self.env.tier) and _looks_back(grasp)
+        # RoboMME-OOD turns a grasp by half a turn if its x axis points towards the robot's base.
+        forward = grasp.to_transformation_matrix()[:2, 0]
+        looks_back = forward @ (grasp.p[:2] - np.array(ROBOT_BASE[:2])) < 0
+        self._reversed = bool(self.env.tier and looks_back)
         if self._reversed:
             grasp = sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi))
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), OPEN)
@@ -186,14 +189,6 @@ def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
     return sapien.Pose(end.position + outward * along, q)
 
 
-def _looks_back(grasp: sapien.Pose) -> bool:
-    """Whether the gripper's x axis points towards the robot's base; RoboMME-OOD then turns the
-    grasp by half a turn.
-    """
-    forward = grasp.to_transformation_matrix()[:2, 0]
-    return bool(forward @ (grasp.p[:2] - np.array(ROBOT_BASE[:2])) < 0)
-
-
 def _direction(cube: Thing, goal: Thing) -> np.ndarray:
     way = goal.position[:2] - cube.position[:2]
     return way / np.linalg.norm(way)
@@ -229,7 +224,8 @@ class StickPrimitives(RobotControl):
         """
         here = self.env.tcp_pose
         poses = [self.at(point, here.q) for point in arc(here.p, target.position, direction)]
-        targets, joints = [], self.env.qpos
+        targets = []
+        joints = self.env.qpos
         for pose in poses:
             solution = self.arm.ik(pose, joints)
             if solution is None:

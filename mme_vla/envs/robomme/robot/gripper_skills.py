@@ -73,7 +73,8 @@ def failing_offset(mode: str, distance: float, seed: int) -> np.ndarray:
     """
     if mode == "z":
         return np.array([0.0, 0.0, distance])
-    draws, signs = Draws(seed), (0, 0)
+    draws = Draws(seed)
+    signs = (0, 0)
     while signs == (0, 0):
         signs = (draws.integer(-1, 2), draws.integer(-1, 2))
     return distance * np.array([*signs, 0.0])
@@ -155,7 +156,7 @@ class GripperPrimitives(RobotControl):
         if close:
             self.announce(above, CLOSE)
             self.close()
-        self.move_to(self._over(button, button.base_z, DOWNWARD_Q), CLOSE)
+        self.move_to(self._over(button, float(button.pose.p[2]), DOWNWARD_Q), CLOSE)
         self.move_to(above, CLOSE)
 
     def hover(self, button: Button) -> None:

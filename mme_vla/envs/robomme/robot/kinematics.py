@@ -53,7 +53,8 @@ class Arm:
         articulation = agent.robot._objs[0]
         self._model = _model(str(agent.urdf_path))
         self._data = self._model.createData()
-        self._tcp, self._wrist = (self._model.getFrameId(name) for name in (TCP, WRIST))
+        self._tcp = self._model.getFrameId(TCP)
+        self._wrist = self._model.getFrameId(WRIST)
         self.base = sapien.Pose(articulation.root_pose.p, articulation.root_pose.q)
         """The base's pose in the world."""
         limits = np.asarray(articulation.qlimits, np.float64)[:ARM_JOINTS]
@@ -62,31 +63,28 @@ class Arm:
 
     def forward(self, qpos: np.ndarray) -> sapien.Pose:
         """Pose of the tool centre point in the world."""
-        return self.base * self.forward_in_base(qpos)
-
-    def forward_in_base(self, qpos: np.ndarray) -> sapien.Pose:
-        """Pose of the tool centre point in the frame of the robot's base."""
-        return sapien.Pose(self.transform(qpos))
+        return self.base * sapien.Pose(self.transform(qpos))
 
     def transform(self, qpos: np.ndarray) -> np.ndarray:
-        """The same as a homogeneous matrix [4, 4] in double precision."""
+        """Pose of the tool centre point in the frame of the robot's base, as a homogeneous matrix
+        [4, 4] in double precision.
+        """
         return np.array(self._place(self._padded(qpos), self._tcp).homogeneous)
 
     def heights(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Places [3] of the tool centre point and of the hand's mounting, in the base frame."""
         tool = np.array(self._place(self._padded(qpos), self._tcp).translation)
-        return tool, np.array(
-            pinocchio.updateFramePlacement(self._model, self._data, self._wrist).translation
-        )
+        wrist = pinocchio.updateFramePlacement(self._model, self._data, self._wrist)
+        return tool, np.array(wrist.translation)
 
     def jacobian(self, qpos: np.ndarray) -> np.ndarray:
         """Spatial Jacobian [6, 7] in the base frame: linear velocity of the point at its origin,
         then angular.
         """
-        full, frame = self._padded(qpos), pinocchio.ReferenceFrame.WORLD
-        return np.array(
-            pinocchio.computeFrameJacobian(self._model, self._data, full, self._tcp, frame)
-        )[:, :ARM_JOINTS]
+        joints = self._padded(qpos)
+        frame = pinocchio.ReferenceFrame.WORLD
+        full = pinocchio.computeFrameJacobian(self._model, self._data, joints, self._tcp, frame)
+        return np.array(full)[:, :ARM_JOINTS]
 
     def within_limits(self, qpos: np.ndarray) -> bool:
         """Whether every arm joint is inside its limits, up to `LIMIT_TOLERANCE`."""
@@ -126,8 +124,10 @@ class Arm:
         """Follow the displacement to a target [4, 4] from joints; the joints [7] where
         that ended.
         """
-        goal, joints = pinocchio.SE3(target), start.copy()
-        damping, frame = _DAMPING * np.eye(6), pinocchio.ReferenceFrame.LOCAL
+        goal = pinocchio.SE3(target)
+        joints = start.copy()
+        damping = _DAMPING * np.eye(6)
+        frame = pinocchio.ReferenceFrame.LOCAL
         for _ in range(_ITERATIONS):
             error = pinocchio.log6(goal.actInv(self._place(joints, self._tcp))).vector
             if np.linalg.norm(error) < _CONVERGED:

@@ -70,7 +70,8 @@ def plan_screw(
     remaining = twist_of(displacement)
     if remaining is None:
         return None
-    path, arrived = [joints.copy()], False
+    path = [joints.copy()]
+    arrived = False
     while not arrived:
         jacobian = arm.jacobian(joints)
         step = np.linalg.pinv(jacobian) @ remaining

@@ -46,11 +46,6 @@ class Button(Thing):
         return np.asarray(pose_of(self.entity).p)
 
     @property
-    def base_z(self) -> float:
-        """Height of the base's centre: how low a press goes, metres."""
-        return float(self.pose.p[2])
-
-    @property
     def depth(self) -> float:
         """How far the cap is pressed down, metres."""
         return max(0.0, -float(self.articulation.get_qpos()[0, 0]))

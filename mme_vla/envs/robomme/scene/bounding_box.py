@@ -39,10 +39,8 @@ def shadow_of_smallest_box(
         Centre [2], the two axes [2, 2], one a row, of length one or, where upright, zero, and half
         the widths [2].
     """
-    points, triangles = (
-        np.frombuffer(vertices).reshape(-1, 3),
-        np.frombuffer(faces, np.int64).reshape(-1, 3),
-    )
+    points = np.frombuffer(vertices).reshape(-1, 3)
+    triangles = np.frombuffer(faces, np.int64).reshape(-1, 3)
     rotation, widths = smallest_box(Trimesh(points, triangles, process=False))
     corners = matrix_product(rotation, points.T)
     middle = corners.min(axis=1) + np.ptp(corners, axis=1) * 0.5
@@ -62,10 +60,13 @@ def smallest_box(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
     hull = mesh.convex_hull
     vertices = np.asarray(hull.vertices, np.float64)
     normals = np.asarray(hull.face_normals, np.float64)
-    least, upright = math.inf, np.eye(3)
+    least = math.inf
+    upright = np.eye(3)
     for azimuth, inclination in _directions(normals):
         turn = _turn_to_vertical(azimuth, inclination)
-        visible = _along(normals, turn[2]) > -_SHORTEST_EDGE
+        up = turn[2]
+        heights = normals[:, 0] * up[0] + normals[:, 1] * up[1] + normals[:, 2] * up[2]
+        visible = heights > -_SHORTEST_EDGE
         if not visible.any():
             continue
         # The outline seen from this direction: edges of which one face is visible and the other is
@@ -110,13 +111,6 @@ def _turn_to_vertical(azimuth: float, inclination: float) -> np.ndarray:
     ])  # fmt: skip
 
 
-def _along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Components [n] of vectors [n, 3] along a direction [3]."""
-    return (
-        vectors[:, 0] * direction[0] + vectors[:, 1] * direction[1] + vectors[:, 2] * direction[2]
-    )
-
-
 def _unit_edges(ends: np.ndarray) -> np.ndarray:
     """Directions [m, 2] of edges given by their ends [n, 2, 2]; edges without length
     are left out.
@@ -130,9 +124,9 @@ def _unit_edges(ends: np.ndarray) -> np.ndarray:
 def _widths_along(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Widths [m, 2] of points [n, 2] along each of the directions [m, 2] and across it."""
     across = np.column_stack((-edges[:, 1], edges[:, 0]))
-    return np.column_stack(
-        [np.ptp(matrix_product(axes, points.T), axis=1) for axes in (edges, across)]
-    )
+    lengths = np.ptp(matrix_product(edges, points.T), axis=1)
+    widths = np.ptp(matrix_product(across, points.T), axis=1)
+    return np.column_stack([lengths, widths])
 
 
 def _smallest_rectangle(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

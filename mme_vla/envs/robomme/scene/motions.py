@@ -93,10 +93,9 @@ class Cover:
         `contents`: what lay open → the container that will stand over it.
         """
         self._contents = contents or {}
-        self._parts = [
-            Appear(container, UNCOVERED_STEPS, parked(group, i))
-            for i, container in enumerate(containers)
-        ]
+        self._parts = []
+        for i, container in enumerate(containers):
+            self._parts.append(Appear(container, UNCOVERED_STEPS, parked(group, i)))
 
     def apply(self, k: int) -> None:
         """Move the containers for the step before which `k` steps were done."""
@@ -106,9 +105,11 @@ class Cover:
 
     def fact(self) -> VisibleFact:
         """What lies open, and where."""
-        names = {cube: container.name for cube, container in self._contents.items()}
-        value = ", ".join(f"{cube}: {name}" for cube, name in names.items())
-        return VisibleFact(value, frozenset(names.values()))
+        texts, names = [], []
+        for cube, container in self._contents.items():
+            texts.append(f"{cube}: {container.name}")
+            names.append(container.name)
+        return VisibleFact(", ".join(texts), frozenset(names))
 
 
 class Swap:
@@ -186,9 +187,11 @@ def sequential_swaps(
     """One swap after another, the first at step `start`; the partner is the nearest object when a
     swap begins.
     """
-    return [
-        Swap(thing, group, start + i * steps, steps=steps) for i, thing in enumerate(initiators)
-    ]
+    swaps = []
+    for thing in initiators:
+        swaps.append(Swap(thing, group, start, steps=steps))
+        start += steps
+    return swaps
 
 
 def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
@@ -203,10 +206,11 @@ def planned_swaps(
     """One swap after another, the first at step `start`; both objects of each are given by their
     indices.
     """
-    return [
-        Swap(group[a], group, start + i * steps, partner=group[b], steps=steps)
-        for i, (a, b) in enumerate(pairs)
-    ]
+    swaps = []
+    for a, b in pairs:
+        swaps.append(Swap(group[a], group, start, partner=group[b], steps=steps))
+        start += steps
+    return swaps
 
 
 def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> dict[str, VisibleFact]:

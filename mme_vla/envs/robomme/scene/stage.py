@@ -109,9 +109,12 @@ class Stage(BaseEnv):
         """While a camera renders on the CPU, links that it cannot see are hidden."""
         if not self._render_device.is_cpu():
             return nullcontext()
-        links = (link._objs[0].entity for link in self.agent.robot.links)
-        bodies = [link.find_component_by_type(RenderBodyComponent) for link in links]
-        return culled([body for body in bodies if body is not None], camera._render_cameras[0])
+        bodies = []
+        for link in self.agent.robot.links:
+            body = link._objs[0].entity.find_component_by_type(RenderBodyComponent)
+            if body is not None:
+                bodies.append(body)
+        return culled(bodies, camera._render_cameras[0])
 
     def _load_scene(self, options: dict) -> None:
         """Put up the table, with nothing on it."""

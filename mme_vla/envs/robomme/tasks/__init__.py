@@ -1,7 +1,5 @@
 """The sixteen tasks, one file each; importing a task registers it."""
 
-import re
-
 import gymnasium
 from mani_skill.utils.registration import register_env
 
@@ -16,8 +14,3 @@ def register_task[T: type[Task]](task: T) -> T:
     if task.__name__ not in gymnasium.registry:
         register_env(task.__name__)(task)
     return task
-
-
-def module_name(task: str) -> str:
-    """`pick_xtimes` for `PickXtimes`."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", task).lower()

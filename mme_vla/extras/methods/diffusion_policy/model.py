@@ -43,12 +43,6 @@ def noise_schedule(steps: int) -> Schedule:
         )
 
 
-def add_noise(schedule: Schedule, chunk: Tensor, noise: Tensor, step: Tensor) -> Tensor:
-    """Noised chunks [b, h, a] at steps [b]."""
-    noisy: Tensor = schedule.add_noise(chunk, noise, step)
-    return noisy
-
-
 def denoise_once(
     schedule: Schedule, predicted: Tensor, step: int, x: Tensor, fresh: Tensor | None
 ) -> Tensor:
@@ -107,13 +101,6 @@ def build_image_encoder() -> nn.Sequential:
         return nn.GroupNorm(channels // 16, channels)
 
     return nn.Sequential(*list(resnet18(weights=None, norm_layer=norm).children())[:8])
-
-
-def map_size(side: int) -> int:
-    """Cells of the encoder's map along a side of so many pixels: halved five times, rounded up."""
-    for _ in range(5):
-        side = -(-side // 2)
-    return side
 
 
 def cell_centres(height: int, width: int, device: torch.device | None = None) -> Tensor:
@@ -239,11 +226,9 @@ class ConditionalUnet1d(nn.Module):
         levels = list(zip([action_dim, *widths[:-1]], widths, strict=True))
         self.down_modules = nn.ModuleList()
         for number, (before, width) in enumerate(levels):
-            half = (
-                Resample(nn.Conv1d(width, width, 3, 2, 1))
-                if number < len(levels) - 1
-                else nn.Identity()
-            )
+            half: nn.Module = nn.Identity()
+            if number < len(levels) - 1:
+                half = Resample(nn.Conv1d(width, width, 3, 2, 1))
             self.down_modules.append(nn.ModuleList([unit(before, width), unit(width, width), half]))
         self.up_modules = nn.ModuleList()
         for before, width in reversed(levels[1:]):  # the first level's skip is never read
@@ -258,7 +243,8 @@ class ConditionalUnet1d(nn.Module):
 
     def forward(self, chunk: Tensor, step: Tensor, condition: Tensor) -> Tensor:
         condition = torch.cat([self.diffusion_step_encoder(step), condition], dim=-1)
-        x, skips = chunk.mT, []
+        x = chunk.mT
+        skips = []
         # lists of modules, whose own modules type checkers do not see
         down: Any = self.down_modules
         up: Any = self.up_modules

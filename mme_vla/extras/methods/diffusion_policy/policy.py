@@ -14,9 +14,8 @@ from torch import Tensor
 from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, missing_extra, require
-from mme_vla.extras.methods.diffusion_policy import model
 from mme_vla.extras.methods.diffusion_policy.config import DiffusionSizes
-from mme_vla.extras.methods.diffusion_policy.model import DiffusionNetwork
+from mme_vla.extras.methods.diffusion_policy.model import DiffusionNetwork, noise_schedule, sample
 from mme_vla.extras.methods.diffusion_policy.processor import DiffusionBatch, DiffusionProcessor
 from mme_vla.integration.film import PooledIntegration
 from mme_vla.memory.base import Memory, full_history
@@ -164,9 +163,8 @@ class DiffusionPolicy(NetworkPolicy):
         memory = self.encode_memory(batch.history)
         with self.autocast():
             condition = self.condition(batch, memory, corner)
-            noisy = model.add_noise(
-                self._schedule(), batch.actions, sampled["noise"], sampled["step"]
-            )
+            schedule = noise_schedule(self.sizes.diffusion_steps)
+            noisy = schedule.add_noise(batch.actions, sampled["noise"], sampled["step"])
             predicted = self.backbone.unet(noisy, sampled["step"], condition)
         losses = (predicted.float() - sampled["noise"]).square().mean(-1)  # b h
         loss = masked_mean(losses, batch.action_mask)
@@ -198,9 +196,6 @@ class DiffusionPolicy(NetworkPolicy):
     def shard_groups(self) -> Sequence[ShardGroup]:
         tower = [] if self.memory is None else [ShardGroup(self.backbone.vision, full=True)]
         return [*tower, ShardGroup(self.backbone.image_encoder), ShardGroup(self.backbone.unet)]
-
-    def _schedule(self) -> Any:
-        return model.noise_schedule(self.sizes.diffusion_steps)
 
     def _cropped_images(self, images: Tensor, corner: tuple[int, int] | None) -> Tensor:
         """Images [..., H, W] uint8, all cropped at one place, in [−1, 1]."""
@@ -252,9 +247,8 @@ class DiffusionPolicy(NetworkPolicy):
                 with self.autocast():
                     return self.backbone.unet(x, step, condition).float()
 
-            return model.sample(
-                self._schedule(), predict, sampled["noise"], sampled["added"], steps
-            )
+            schedule = noise_schedule(self.sizes.diffusion_steps)
+            return sample(schedule, predict, sampled["noise"], sampled["added"], steps)
 
     # Episodes
 

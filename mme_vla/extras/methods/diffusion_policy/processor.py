@@ -142,10 +142,8 @@ class DiffusionProcessor(GoalProcessor):
         self.embodiment = embodiment
         width = check_integer("processor.text_dim", text_dim)
         folder = CLIP if text == CLIP_NAME else text
-        self.text_name, self.text = (
-            text,
-            HashedWords(width) if text == HASHED else ClipText(width, folder),
-        )
+        self.text_name = text
+        self.text = HashedWords(width) if text == HASHED else ClipText(width, folder)
         self.samples = SampleSpec(window=window, consecutive=frames == FRAMES[0])
         self.memory_size = check_integer("processor.memory_size", memory_size)
         self.stats = stats
@@ -191,12 +189,11 @@ class DiffusionProcessor(GoalProcessor):
         self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
     ) -> Tensor:
         """Memory frames [n, H, W, 3] uint8 as [n, 3, s, s] float32 in [−1, 1]."""
-        array = (
-            frames
-            if isinstance(frames, Tensor)
-            else torch.from_numpy(np.require(frames, requirements=["C", "W"]))
-        )
-        return resize_with_pad(array.to(device) if device is not None else array, self.memory_size)
+        if not isinstance(frames, Tensor):
+            frames = torch.from_numpy(np.require(frames, requirements=["C", "W"]))
+        if device is not None:
+            frames = frames.to(device)
+        return resize_with_pad(frames, self.memory_size)
 
     def states(self, raw: np.ndarray | Tensor) -> Tensor:
         """Raw states [..., s] between their extremes, −1 … 1."""
@@ -208,10 +205,10 @@ class DiffusionProcessor(GoalProcessor):
         """Recorded actions [h, w] between their extremes, relative first if the
         embodiment says so.
         """
-        raw, at = (torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
-        return normalize(
-            self.embodiment.action.to_relative(raw, at), self.require_stats().actions, BY
-        )
+        raw = torch.as_tensor(chunk, dtype=torch.float32)
+        at = torch.as_tensor(state, dtype=torch.float32)
+        relative = self.embodiment.action.to_relative(raw, at)
+        return normalize(relative, self.require_stats().actions, BY)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
         """A chunk [..., h, a] as actions [..., h, w]: the inverse of `actions`."""

@@ -3,6 +3,7 @@ beside them.
 """
 
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.extras.methods.diffusion_policy.model import cell_centres, map_size
+from mme_vla.extras.methods.diffusion_policy.model import cell_centres
 from mme_vla.extras.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import cast
@@ -33,9 +34,8 @@ _GRID = "image_pool.0.pos_grid"
 def is_diffusion_policy(names: Iterable[str]) -> bool:
     """Whether tensors are named as in the authors' checkpoints, in whatever wrapping."""
     unwrapped_names = {unwrapped(name) for name in names}
-    return "image_pool.0.nets.weight" in unwrapped_names and any(
-        name.startswith(f"{_UNET}down_modules.") for name in unwrapped_names
-    )
+    has_unet = any(name.startswith(f"{_UNET}down_modules.") for name in unwrapped_names)
+    return has_unet and "image_pool.0.nets.weight" in unwrapped_names
 
 
 def unwrapped(name: str) -> str:
@@ -59,12 +59,12 @@ def diffusion_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors; a memory and its tower have none."""
     if not isinstance(policy, DiffusionPolicy):
         raise wrong_policy(policy, "Diffusion Policy", "model=diffusion_policy")
-    table = {
-        name: [Piece(name.replace(_LOCAL, _UNET).removeprefix("backbone."))]
-        for name in policy.state_dict()
-        if policy.finetune_spec.component_of(name) not in ("memory", "vision")
-    }
-    height, width = (map_size(side) for side in policy.sizes.cropped)
+    table = {}
+    for name in policy.state_dict():
+        if policy.finetune_spec.component_of(name) not in ("memory", "vision"):
+            table[name] = [Piece(name.replace(_LOCAL, _UNET).removeprefix("backbone."))]
+    # The image encoder halves an image five times, rounding up.
+    height, width = (math.ceil(side / 32) for side in policy.sizes.cropped)
     return Adapter(table, derived=[Derived(_GRID, partial(cell_centres, height, width))])
 
 

@@ -74,7 +74,8 @@ class Schedule:
         visited = self.ddim_steps(count)
         left = self.alphas_cumprod[visited]
         before = np.concatenate([[1.0], left[:-1]])
-        x, path = noise, []
+        x = noise
+        path = []
         for i in reversed(range(count)):
             predicted = predict(x, int(visited[i]))
             clean = float(np.sqrt(1 / left[i])) * x - float(np.sqrt(1 / left[i] - 1)) * predicted

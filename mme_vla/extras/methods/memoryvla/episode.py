@@ -64,7 +64,8 @@ class MemoryVlaEpisode(Episode):
 
     @banks.setter
     def banks(self, banks: BankStates) -> None:
-        self._banks, self._moments = banks, []
+        self._banks = banks
+        self._moments = []
 
     def _take(
         self,
@@ -96,17 +97,17 @@ class MemoryVlaEpisode(Episode):
 
     def writable_memory(self) -> tuple[MemoryEntries, ...]:
         """The entries of both banks, each with its times."""
-        named = (("cognition", self.banks.cognition), ("perceptual", self.banks.perceptual))
-        return tuple(
-            MemoryEntries(
-                name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count
-            )
-            for name, bank in named
-        )
+        stores = []
+        for name in ("cognition", "perceptual"):
+            bank: BankState = getattr(self.banks, name)
+            entries = tuple(zip(bank.times.tolist(), bank.entries, strict=True))
+            stores.append(MemoryEntries(name, entries, self.banks.count))
+        return tuple(stores)
 
     def with_entries(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
-        twin, banks = copy.copy(self), self.banks
+        banks = self.banks
         cognition, perceptual = stores
+        twin = copy.copy(self)
         twin.banks = replace(
             banks,
             cognition=_bank(cognition, banks.cognition),
@@ -120,11 +121,7 @@ class MemoryVlaEpisode(Episode):
 
 
 def _bank(entries: Sequence[tuple[int, Tensor]], like: BankState) -> BankState:
-    contents = torch.stack([content for _, content in entries]) if entries else like.entries[:0]
-    return BankState(contents, like.times.new_tensor([time for time, _ in entries]))
-
-
-def words(prompts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Prompts as a batch: ids [b, l] and mask [b, l]."""
-    ids, masks = zip(*prompts, strict=True)
-    return torch.stack(ids), torch.stack(masks)
+    if not entries:
+        return BankState(like.entries[:0], like.times[:0])
+    times, contents = zip(*entries, strict=True)
+    return BankState(torch.stack(contents), like.times.new_tensor(times))

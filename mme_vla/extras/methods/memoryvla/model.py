@@ -146,7 +146,8 @@ class Core(nn.Module):
 
     def __init__(self, config: MemoryVlaConfig, **past: Retrieval) -> None:
         super().__init__()
-        self.config, self.patches = config, config.vision.grid**2
+        self.config = config
+        self.patches = config.vision.grid**2
         d, e = (module.width for module in past.values())
         self.compression = Compression(config.vision.width, config.compression_width, e)
         for name, module in past.items():
@@ -185,9 +186,9 @@ class Core(nn.Module):
             draws: `noise` [r·m, h, a], `steps` [r·m], `drop` [r·m] uniform.
         """
         repeats = len(draws["noise"]) // len(actions)
-        cognition, perceptual, actions = (
-            x.repeat(repeats, 1, 1) for x in (cognition, perceptual, actions)
-        )
+        actions = actions.repeat(repeats, 1, 1)
+        cognition = cognition.repeat(repeats, 1, 1)
+        perceptual = perceptual.repeat(repeats, 1, 1)
         noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
         drop = draws["drop"] < self.config.dropout
         predicted = self.head(noised, draws["steps"], cognition, perceptual, drop)
@@ -216,14 +217,11 @@ class RecallingCore(Core):
     perceptual_retrieval: MemoryRetrieval
 
     def __init__(self, config: MemoryVlaConfig) -> None:
-        widths, of_bank = (config.vlm.width, config.perceptual_width), config.bank
+        read = config.perceptual_width
         # Without a time code: tokens of a memory carry their own time and place.
-        cognition, perceptual = (
-            MemoryRetrieval(
-                width, of_bank.retrieval_layers, False, of_bank.fusion, config.perceptual_width
-            )
-            for width in widths
-        )
+        options = (config.bank.retrieval_layers, False, config.bank.fusion, read)
+        cognition = MemoryRetrieval(config.vlm.width, *options)
+        perceptual = MemoryRetrieval(config.perceptual_width, *options)
         super().__init__(config, cognition_retrieval=cognition, perceptual_retrieval=perceptual)
 
     def through(
@@ -276,12 +274,12 @@ class MemoryVlaCore(Core):
         """What the head reads of b episodes' current moments: fused cognition [b, 1, d] and
         perceptual tokens.
         """
-        return (
-            self.cognition_bank.read([state.cognition for state in states], cognition),
-            self.perceptual_bank.read(
-                [state.perceptual for state in states], self.compression(features)
-            ),
-        )
+        cognition_states, perceptual_states = [], []
+        for state in states:
+            cognition_states.append(state.cognition)
+            perceptual_states.append(state.perceptual)
+        fused = self.cognition_bank.read(cognition_states, cognition)
+        return fused, self.perceptual_bank.read(perceptual_states, self.compression(features))
 
     def store(self, state: BankStates, cognition: Tensor, features: Tensor) -> BankStates:
         """One episode's banks after the moment [1, d], [p, c]; its time is how many
@@ -300,8 +298,9 @@ def build_core(config: MemoryVlaConfig, recalls: bool) -> Core:
     """A fresh core that recalls through a memory, or has banks of its own."""
     if recalls:
         return RecallingCore(config)
-    widths = (config.vlm.width, config.perceptual_width)
-    return MemoryVlaCore(config, *(EpisodeBank(width, **vars(config.bank)) for width in widths))
+    cognition = EpisodeBank(config.vlm.width, **vars(config.bank))
+    perceptual = EpisodeBank(config.perceptual_width, **vars(config.bank))
+    return MemoryVlaCore(config, cognition, perceptual)
 
 
 def cognition_token(hidden: Tensor, patches: int, words: Tensor) -> Tensor:

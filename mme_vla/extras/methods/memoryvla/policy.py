@@ -15,7 +15,7 @@ from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.backbone.building import shapes_only
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, require
-from mme_vla.extras.methods.memoryvla.episode import MemoryVlaEpisode, words
+from mme_vla.extras.methods.memoryvla.episode import MemoryVlaEpisode
 from mme_vla.extras.methods.memoryvla.model import (
     BankStates,
     Core,
@@ -221,12 +221,13 @@ class MemoryVlaPolicy(NetworkPolicy):
         changes = values.pop("changes", None)
         if changes is not None:
             changes = changes.to(self.device)
-        copies = batch.valid.shape[1]
+        longest = batch.valid.shape[1]
 
-        def repeat_batch(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
-            return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
+        def of_moments(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
+            copied = value.to(self.device)[:, :, :longest].transpose(0, 1)
+            return copied[:, batch.valid].flatten(0, 1)
 
-        sampled = map_noise(values, lambda value: repeat_batch(value.to(self.device)))
+        sampled = map_noise(values, of_moments)
         memory = self.encode_memory(batch.histories())
         cognition, features, groups = self._of_batch(batch, changes)
         with self.autocast():
@@ -237,8 +238,8 @@ class MemoryVlaPolicy(NetworkPolicy):
             losses = self.core.noise_error(batch.actions[batch.valid], read, perceptual, sampled)
         counted = None
         if batch.action_mask is not None:
-            of_moments = batch.action_mask[batch.valid]
-            counted = of_moments.repeat(len(losses) // len(of_moments), 1)
+            mask = batch.action_mask[batch.valid]
+            counted = mask.repeat(len(losses) // len(mask), 1)
         loss = masked_mean(losses, counted)
         metrics = {"loss": loss.detach()}
         if memory is not None:
@@ -249,20 +250,17 @@ class MemoryVlaPolicy(NetworkPolicy):
         self.vlm.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        full_modules = (self.vlm.vision, self.vlm.language.model.embed_tokens)
-        layers = (*self.vlm.language.model.layers, *self.core.head.blocks)
+        language = self.vlm.language.model
         return [
-            *(ShardGroup(module, full=True) for module in full_modules),
-            *map(ShardGroup, layers),
+            ShardGroup(self.vlm.vision, full=True),
+            ShardGroup(language.embed_tokens, full=True),
+            *map(ShardGroup, (*language.layers, *self.core.head.blocks)),
         ]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers, the language model's layers and the head's blocks, each by itself."""
-        towers, layers = (
-            (self.vlm.vision.dino, self.vlm.vision.siglip),
-            self.vlm.language.model.layers,
-        )
-        for module in (*towers, *layers, *self.core.head.blocks):
+        towers = (self.vlm.vision.dino, self.vlm.vision.siglip)
+        for module in (*towers, *self.vlm.language.model.layers, *self.core.head.blocks):
             module.compile(**options)
         compile_parts(self.memory, **options)
 
@@ -313,17 +311,22 @@ class MemoryVlaPolicy(NetworkPolicy):
         """The current moments of running episodes, each a group of one; only banks know what number
         theirs has.
         """
-        images = self.require_processor().prepare_images(
-            torch.stack([episode.images for episode in episodes])
+        images, ids, masks = [], [], []
+        times = torch.zeros(len(episodes), 1, dtype=torch.int64)
+        for i, episode in enumerate(episodes):
+            images.append(episode.images)
+            ids.append(episode.prompt[0])
+            masks.append(episode.prompt[1])
+            if self.memory is None:
+                times[i] = _memoryvla_episode(episode).banks.count
+        batch = GroupBatch(
+            images=self.require_processor().prepare_images(torch.stack(images))[:, None],
+            prompt=torch.stack(ids)[:, None],
+            prompt_mask=torch.stack(masks)[:, None],
+            times=times,
+            valid=torch.ones(len(episodes), 1, dtype=torch.bool),
         )
-        ids, masks = words([episode.prompt for episode in episodes])
-        times = torch.zeros(len(episodes), dtype=torch.int64)
-        if self.memory is None:
-            times = torch.tensor([_memoryvla_episode(e).banks.count for e in episodes])
-        valid = torch.ones(len(episodes), 1, dtype=torch.bool)
-        return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(
-            self.device
-        )
+        return batch.to(self.device)
 
     def predict_chunk(
         self,
@@ -380,10 +383,9 @@ class MemoryVlaPolicy(NetworkPolicy):
     @property
     def memory_tower(self) -> MemoryTower:
         vlm = self.vlm
-        processor = self.processor
-        image_format = (
-            processor.memory_image_format if isinstance(processor, MemoryVlaProcessor) else ""
-        )
+        image_format = ""
+        if isinstance(self.processor, MemoryVlaProcessor):
+            image_format = self.processor.memory_image_format
         settings = (image_format, str(vlm.vision.dino_standard))
         return MemoryTower(vlm.vision, vlm.pooled_tokens, self.sizes.vision.width, settings)
 

@@ -109,10 +109,9 @@ class MemoryVlaProcessor(OpenVlaProcessor):
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """As `OpenVlaProcessor.actions`; numbers that are commanded as −1 or 1 stay as they are."""
-        raw = self.embodiment.action.to_relative(
-            *(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
-        )
-        return self._quantiles().normalize(raw)
+        raw = torch.as_tensor(chunk, dtype=torch.float32)
+        at = torch.as_tensor(state, dtype=torch.float32)
+        return self._quantiles().normalize(self.embodiment.action.to_relative(raw, at))
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
         """As `OpenVlaProcessor.absolute_actions`, of chunks that are clipped to ±1 first."""

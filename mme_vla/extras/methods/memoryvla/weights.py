@@ -82,8 +82,12 @@ def memoryvla_piece(target: str) -> Piece | None:
 
 def memoryvla_table(names: Iterable[str]) -> NameTable:
     """The table of those of our tensors that have a name there."""
-    pairs = ((name, memoryvla_piece(name)) for name in names)
-    return {target: [piece] for target, piece in pairs if piece is not None}
+    table: NameTable = {}
+    for name in names:
+        piece = memoryvla_piece(name)
+        if piece is not None:
+            table[name] = [piece]
+    return table
 
 
 WEIGHTS = "model.pt"

@@ -45,10 +45,8 @@ class ActionHead(nn.Module):
 
     def __init__(self, width: int, action_dim: int, blocks: int = 2) -> None:
         super().__init__()
-        self.input_norm, self.input = (
-            nn.LayerNorm(action_dim * width),
-            nn.Linear(action_dim * width, width),
-        )
+        self.input_norm = nn.LayerNorm(action_dim * width)
+        self.input = nn.Linear(action_dim * width, width)
         self.blocks = nn.ModuleList(ResidualMLP(width) for _ in range(blocks))
         self.output_norm, self.output = nn.LayerNorm(width), nn.Linear(width, action_dim)
 
@@ -170,32 +168,32 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, Recomputes):
         The words of one sample may be fewer than another's. Slots and `</s>` follow each one's last
         word by position; attention has no other order, so the padding between does no harm.
         """
-        by_name = {
-            block.name: block
-            for block in blocks
-            if block.name in ("begin", "images", "state", "prompt")
-        }
-        prompt = by_name.pop("prompt")
-        before = [
-            *by_name.values(),
-            *(block for block in blocks if block.name not in ("prompt", *by_name)),
-        ]
+        observed, memories, prompts = [], [], []
+        for block in blocks:
+            if block.name == "prompt":
+                prompts.append(block)
+            elif block.name in ("begin", "images", "state"):
+                observed.append(block)
+            else:
+                memories.append(block)
+        (prompt,) = prompts
         slots = self.horizon * self.action_dim
         zeros = prompt.tokens.new_zeros(len(prompt.tokens), slots, prompt.tokens.shape[-1])
+        parts, masks = [], []
+        for block in (*observed, *memories, prompt):
+            parts.append(block.tokens.to(zeros))
+            masks.append(block.mask)
         end = self.vlm.embed(
             torch.full_like(prompt.mask[:, :1], self.config.end_id, dtype=torch.long)
         )
-        tokens = torch.cat(
-            [*(block.tokens.to(zeros) for block in (*before, prompt)), zeros, end], 1
-        )
+        tokens = torch.cat([*parts, zeros, end], 1)
         tail = torch.ones_like(prompt.mask[:, :1]).expand(-1, slots + 1)
-        valid = torch.cat([*(block.mask for block in before), prompt.mask, tail], 1)
-        start = sum(len(block) for block in before)
+        valid = torch.cat([*masks, tail], 1)
+        first = tokens.shape[1] - slots - 1  # of the slots
+        start = first - len(prompt)
         words = prompt.mask.sum(1, keepdim=True)
         here = torch.arange(tokens.shape[1], device=tokens.device).expand(len(tokens), -1)
-        after = here >= start + len(prompt)
-        positions = here - after * (len(prompt) - words)
-        first = start + len(prompt)
+        positions = here - (here >= first) * (len(prompt) - words)
         read = torch.cat([start + words - 1, here[:, first : first + slots - 1]], 1)
         return TokenSequence(tokens, valid, positions, read)
 

@@ -38,10 +38,9 @@ class OpenVlaPolicy(MMEPolicy):
 
     @property
     def memory_tower(self) -> MemoryTower:
-        processor = self.processor
-        settings = (
-            [processor.memory_image_format] if isinstance(processor, OpenVlaProcessor) else []
-        )
+        settings = []
+        if isinstance(self.processor, OpenVlaProcessor):
+            settings.append(self.processor.memory_image_format)
         return super().memory_tower._replace(settings=settings)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
@@ -57,7 +56,8 @@ class OpenVlaPolicy(MMEPolicy):
 
     def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
         flat = images.flatten(0, 1)
-        cropped = (
-            centre_crop(flat) if augmentation is None else augment(flat, augmentation.flatten(0, 1))
-        )
+        if augmentation is None:
+            cropped = centre_crop(flat)
+        else:
+            cropped = augment(flat, augmentation.flatten(0, 1))
         return to_unit_range(cropped).view(images.shape)

@@ -45,11 +45,10 @@ class ClippedQuantiles:
         """
         low, high = np.asarray(stats.q01, np.float64), np.asarray(stats.q99, np.float64)
         least, most = getattr(stats, "min", None), getattr(stats, "max", None)
-        ends = (
-            (low, high) if least is None or most is None else (np.asarray(least), np.asarray(most))
-        )
+        if least is None or most is None:
+            least, most = low, high
         every = np.ones(len(low), bool) if scaled is None else np.asarray(scaled, bool)
-        return cls(low, high, every, ends[0] == ends[1])
+        return cls(low, high, every, np.asarray(least) == np.asarray(most))
 
     def normalize(self, x: Tensor) -> Tensor:
         """Scale x [..., d]: clip(2 (x − q01) / (q99 − q01 + ε) − 1, ±1), and 0 where nothing ever
@@ -71,12 +70,11 @@ class ClippedQuantiles:
             f" {list(x.shape)}.",
         )
         still = self.still if len(self.still) else np.zeros(len(self.low), bool)
-        scaled, motionless = (torch.from_numpy(flag).to(x.device) for flag in (self.scaled, still))
         return (
             x.new_tensor(self.low),
             x.new_tensor(self.high - self.low + EPSILON),
-            scaled,
-            motionless,
+            torch.from_numpy(self.scaled).to(x.device),
+            torch.from_numpy(still).to(x.device),
         )
 
 
@@ -314,10 +312,10 @@ class OpenVlaProcessor(Processor):
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """As `Processor.actions`, clipped."""
-        raw = self.embodiment.action.to_relative(
-            *(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
-        )
-        return ClippedQuantiles.of(self.require_stats().actions).normalize(raw)
+        raw = torch.as_tensor(chunk, dtype=torch.float32)
+        at = torch.as_tensor(state, dtype=torch.float32)
+        relative = self.embodiment.action.to_relative(raw, at)
+        return ClippedQuantiles.of(self.require_stats().actions).normalize(relative)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
         raw = ClippedQuantiles.of(self.require_stats().actions).unnormalize(chunk.float())

@@ -97,11 +97,8 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
         isinstance(rank, int) and isinstance(alpha, int | float) and rank >= 1,
         f"{folder / FOLDER / SETTINGS} has r={brief(rank)}, lora_alpha={brief(alpha)}: no LoRA's.",
     )
-    if other := [
-        name
-        for name in ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern")
-        if settings.get(name)
-    ]:
+    unread = ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern")
+    if other := [name for name in unread if settings.get(name)]:
         raise UserError(
             f"{folder / FOLDER / SETTINGS} sets {listed(other)}, which are not read: merge it with"
             " peft."
@@ -162,12 +159,11 @@ def openvla_adapter(policy: Policy) -> Adapter:
     if not isinstance(policy, OpenVlaPolicy | MemoryVlaPolicy):
         change = "model=openvla_oft, or start model=memoryvla from it (init_from=…)"
         raise wrong_policy(policy, "OpenVLA and OpenVLA-OFT", change)
-    names = [
-        name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name
-    ]
     table = {}
     fresh = set()
-    for name in names:
+    for name in policy.state_dict():
+        if ".lora_" in name or ".base_layer." in name:
+            continue
         source = openvla_name(name)
         if source is not None:
             table[name] = [Piece(source)]
@@ -238,24 +234,17 @@ def write_openvla(
     from safetensors.torch import save_file
 
     released = openvla_adapter(policy).export(policy.state_dict())
-    ready = {
-        name: cast(tensor.detach(), dtype).cpu().contiguous() for name, tensor in released.items()
-    }
-
-    def of(module: str, before: str = "") -> dict[str, Tensor]:
-        return {
-            before + name.removeprefix(module): x
-            for name, x in ready.items()
-            if name.startswith(module)
-        }
-
-    save_file(of(VLA), folder / WEIGHTS, metadata={"format": "pt"})
+    modules: dict[str, dict[str, Tensor]] = {VLA: {}, HEAD: {}, STATE: {}}
+    for source, tensor in released.items():
+        module, slash, name = source.partition("/")
+        modules[module + slash][name] = cast(tensor.detach(), dtype).cpu().contiguous()
+    save_file(modules[VLA], folder / WEIGHTS, metadata={"format": "pt"})
     for module in (HEAD, STATE):
-        if tensors := of(module, _WRAPPED):
-            torch.save(tensors, folder / f"{module.rstrip('/')}--0_checkpoint.pt")
+        wrapped = {f"{_WRAPPED}{name}": tensor for name, tensor in modules[module].items()}
+        if wrapped:
+            torch.save(wrapped, folder / f"{module.rstrip('/')}--0_checkpoint.pt")
     if stats is not None:
-        statistics = {
-            released: getattr(stats, target_name).to_dict()
-            for target_name, released in _FEATURES.items()
-        }
+        statistics = {}
+        for name, feature in _FEATURES.items():
+            statistics[feature] = getattr(stats, name).to_dict()
         (folder / STATISTICS).write_text(json.dumps({DATASET: statistics}, indent=2) + "\n")

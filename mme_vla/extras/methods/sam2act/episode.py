@@ -46,7 +46,10 @@ class SceneInputs:
 
     def to(self, device: torch.device) -> "SceneInputs":
         return SceneInputs(
-            *(x.to(device) for x in (self.points, self.colours, self.state, self.language))
+            points=self.points.to(device),
+            colours=self.colours.to(device),
+            state=self.state.to(device),
+            language=self.language.to(device),
         )
 
 
@@ -65,25 +68,22 @@ def decide(
         gripper −1 (closed) or 1. Whether the way there may touch things, which the network tells
         too, the benchmark's planner does not ask.
     """
-    points, colours, state, language = (
-        x[None] for x in (scene.points, scene.colours, scene.state, scene.language)
-    )
-    side, zoom = network.sizes.side, ZOOM
+    points, colours = scene.points[None], scene.colours[None]
+    state, language = scene.state[None], scene.language[None]
+    side = network.sizes.side
     views = network.encode_views(cloud_images(points, colours, cube, side), state, language)
     logits, remembered = network.coarse_step(views, remembered)
     first = finder.find(logits)
-    closer = network.encode_views(
-        zoomed_images(points, colours, cube, first, zoom, side), state, language
-    )
-    logits, tokens = network.fine_step(closer)
+    near = zoomed_images(points, colours, cube, first, ZOOM, side)
+    logits, tokens = network.fine_step(network.encode_views(near, state, language))
     point = finder.find(logits)
     outputs = network.heads(tokens, point)
     bins = torch.stack([outputs[axis].argmax(-1) for axis in "xyz"], -1)
     angles = torch.deg2rad(angles_of_bins(bins, network.sizes.rotation_bins)).float()
     grip = 2.0 * outputs["gripper"].argmax(-1, keepdim=True) - 1
-    return torch.cat([cube.back(zoom_back(point, first, zoom)), angles, grip], -1)[
-        0
-    ].float(), remembered
+    position = cube.back(zoom_back(point, first, ZOOM))
+    waypoint = torch.cat([position, angles, grip], -1)[0].float()
+    return waypoint, remembered
 
 
 @torch.no_grad()
@@ -93,12 +93,8 @@ def watch(
     """What an episode remembers after a frame at which nothing is decided, such as one of the
     conditioning video.
     """
-    points, colours, state, language = (
-        x[None] for x in (scene.points, scene.colours, scene.state, scene.language)
-    )
-    views = network.encode_views(
-        cloud_images(points, colours, cube, network.sizes.side), state, language
-    )
+    images = cloud_images(scene.points[None], scene.colours[None], cube, network.sizes.side)
+    views = network.encode_views(images, scene.state[None], scene.language[None])
     return network.coarse_step(views, remembered)[1]
 
 
@@ -160,22 +156,17 @@ class KeyframeEpisode(Episode):
         places = range(len(demo)) if rendered is None else next(iter(rendered.values())).tolist()
         processor = self._policy.require_processor()
         fingers = np.asarray(states, np.float32)[:, -1]
-        self._video += [
-            (processor.shots(frames, i), float(fingers[at]))
-            for i, at in enumerate(places)
-            if demo[at]
-        ]
+        for i, at in enumerate(places):
+            if demo[at]:
+                self._video.append((processor.shots(frames, i), float(fingers[at])))
         if len(demo) and not demo[-1]:
             self._store_video()
             if self._after is not None:
                 self.remembered, self._after = self._after, None
                 self.waypoints += 1
-            current_rendered = len(places) > 0 and places[-1] == len(demo) - 1
-            self._now = (
-                (processor.shots(frames, len(places) - 1), float(fingers[-1]))
-                if current_rendered
-                else None
-            )
+            self._now = None
+            if len(places) and places[-1] == len(demo) - 1:
+                self._now = (processor.shots(frames, len(places) - 1), float(fingers[-1]))
 
     def scene_inputs(self) -> SceneInputs:
         """What the network is shown now."""
@@ -220,13 +211,11 @@ class KeyframeEpisode(Episode):
     def _store_video(self) -> None:
         most = self._policy.require_processor().video_frames
         count = min(len(self._video), most)
-        for place, index in enumerate(
-            np.linspace(0, len(self._video) - 1, count).round().astype(int)
-        ):
+        spread = np.linspace(0, len(self._video) - 1, count).round().astype(int)
+        for place, index in enumerate(spread):
             shots, finger = self._video[index]
-            self.remembered = self._policy.watch(
-                self._scene_inputs(shots, finger, place), self.remembered
-            )
+            scene = self._scene_inputs(shots, finger, place)
+            self.remembered = self._policy.watch(scene, self.remembered)
         self._video = []
 
     def _scene_inputs(self, shots: list[Shot], finger: float, place: int) -> SceneInputs:

@@ -23,7 +23,9 @@ def unproject(depth: np.ndarray, intrinsic: np.ndarray, extrinsic: np.ndarray) -
         intrinsic: [3, 3].
         extrinsic: world to camera, [3, 4] or [4, 4].
     """
-    depth, intrinsic, extrinsic = (np.asarray(x, np.float64) for x in (depth, intrinsic, extrinsic))
+    depth = np.asarray(depth, np.float64)
+    intrinsic = np.asarray(intrinsic, np.float64)
+    extrinsic = np.asarray(extrinsic, np.float64)
     rows, columns = np.indices(depth.shape, dtype=np.float64)
     x = (columns - intrinsic[0, 2]) / intrinsic[0, 0] * depth
     y = (rows - intrinsic[1, 2]) / intrinsic[1, 1] * depth
@@ -146,9 +148,9 @@ def angles_of(quaternions: Tensor) -> Tensor:
     roll = torch.where(up, 2 * difference, torch.where(down, 2 * added, difference + added))
     yaw = torch.where(up | down, 0.0, added - difference)
     tilt = torch.where(up, 90.0, torch.where(down, -90.0, tilt))
-    return torch.stack(
-        [_wrap_angle(torch.rad2deg(roll)), tilt, _wrap_angle(torch.rad2deg(yaw))], -1
-    )
+    turns = torch.rad2deg(torch.stack([roll, yaw]))
+    roll, yaw = 180 - (180 - turns).remainder(360)  # into (−180, 180]
+    return torch.stack([roll, tilt, yaw], -1)
 
 
 def to_bins(quaternions: Tensor, count: int) -> Tensor:
@@ -162,10 +164,6 @@ def to_bins(quaternions: Tensor, count: int) -> Tensor:
 def angles_of_bins(bins: Tensor, count: int) -> Tensor:
     """The angles [..., 3] in degrees of bins [..., 3]."""
     return bins.double() * (360 / count) - 180
-
-
-def _wrap_angle(degrees: Tensor) -> Tensor:
-    return 180 - (180 - degrees).remainder(360)
 
 
 SIGMA = 1.5
@@ -258,20 +256,19 @@ class PointFinder:
         zero = torch.zeros_like(first)
         # top is seen by (x, y), front by (y, z), right by (x, z)
         axes = [(first, second, zero), (zero, first, second), (first, zero, second)]
-        pixels = torch.stack(
-            [project(torch.stack(xyz, -1), side)[..., view, :] for view, xyz in enumerate(axes)]
-        )
-        self._numbers, self._weights = corners(pixels, side, side)
+        pixels = []
+        for view, xyz in enumerate(axes):
+            pixels.append(project(torch.stack(xyz, -1), side)[..., view, :])
+        self._numbers, self._weights = corners(torch.stack(pixels), side, side)
 
     def scores(self, heatmaps: Tensor) -> Tensor:
         """The views' mean at every cell, [side, side, side] by x, y, z, of maps [3, side, side]."""
         flat = heatmaps.flatten(1)
-        read = [
-            (flat[view][self._numbers[view]] * self._weights[view]).sum(-1)
-            for view in range(len(flat))
-        ]
+        read = []
+        for values, numbers, weights in zip(flat, self._numbers, self._weights, strict=True):
+            read.append((values[numbers] * weights).sum(-1))
         top, front, right = read
-        return (top[:, :, None] + front[None] + right[:, None, :]) / len(read)
+        return (top[:, :, None] + front[None] + right[:, None, :]) / VIEWS
 
     def find(self, logits: Tensor) -> Tensor:
         """The best points [b, 3] of logits [b, 3, 1, side, side]; the first of equal ones."""
@@ -300,7 +297,8 @@ def z_buffer(points: Tensor, features: Tensor, side: int) -> tuple[Tensor, Tenso
     Returns:
         images [3, side, side, c], zero where nothing is, and depths [3, side, side], `EMPTY` there.
     """
-    count, free = len(points), torch.iinfo(torch.int64).max
+    count = len(points)
+    free = torch.iinfo(torch.int64).max
     pixels = project(points, side).permute(1, 0, 2)  # v n 2
     columns, rows = pixels.unbind(-1)
     inside = (
@@ -394,13 +392,9 @@ def _shifted(image: Tensor, across: int, down: int, fill: float) -> Tensor:
     """[v, s, s] whose pixel (row, column) is the given one's (row + down, column + across)."""
     side = image.shape[-1]
     shifted = torch.full_like(image, fill)
-    rows, columns = (
-        slice(max(-down, 0), side - max(down, 0)),
-        slice(max(-across, 0), side - max(across, 0)),
-    )
-    there_rows, there_columns = (
-        slice(max(down, 0), side + min(down, 0)),
-        slice(max(across, 0), side + min(across, 0)),
-    )
+    rows = slice(max(-down, 0), side - max(down, 0))
+    columns = slice(max(-across, 0), side - max(across, 0))
+    there_rows = slice(max(down, 0), side + min(down, 0))
+    there_columns = slice(max(across, 0), side + min(across, 0))
     shifted[:, rows, columns] = image[:, there_rows, there_columns]
     return shifted

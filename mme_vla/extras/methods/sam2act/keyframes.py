@@ -7,7 +7,7 @@ made of, one `.npz` an episode.
 """
 
 import zipfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -50,12 +50,13 @@ _ARRAYS = (
 def motions_of(episode: RawEpisode) -> Motions:
     """The planned motions of a whole episode: those of the video, then those of the execution."""
     rows = episode.pose_actions("waypoint_actions")
-    parts = [(0, episode.exec_start), (episode.exec_start, episode.length)]
-    motions = [find_motions(rows[start:stop], start) for start, stop in parts if stop > start]
-    return Motions(
-        np.concatenate([part.decisions for part in motions]),
-        np.concatenate([part.targets for part in motions]),
-    )
+    decisions, targets = [], []
+    for start, stop in ((0, episode.exec_start), (episode.exec_start, episode.length)):
+        if stop > start:
+            motions = find_motions(rows[start:stop], start)
+            decisions.append(motions.decisions)
+            targets.append(motions.targets)
+    return Motions(np.concatenate(decisions), np.concatenate(targets))
 
 
 @SIDE_FILES.register("keyframes")
@@ -72,13 +73,11 @@ class KeyframeFile:
         """Keep the keyframes of a recorded episode; returns how many frames those are."""
         motions = motions_of(episode)
         frames = np.union1d(np.arange(0, episode.length, ENTRY_EVERY), motions.decisions)
-        arrays: dict[str, list[np.ndarray]] = {
-            name: [] for name in ("colours", "depth", "intrinsic", "extrinsic")
-        }
+        arrays: dict[str, list[np.ndarray]] = defaultdict(list)
         for frame in frames:
             shots = [Shot(**episode.shot(int(frame), camera)).shrunk(side) for camera in CAMERAS]
-            for name, values in arrays.items():
-                values.append(np.stack([getattr(shot, name) for shot in shots]))
+            for name in ("colours", "depth", "intrinsic", "extrinsic"):
+                arrays[name].append(np.stack([getattr(shot, name) for shot in shots]))
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as draft, draft.open("wb") as file:
             np.savez_compressed(
@@ -144,9 +143,8 @@ class EpisodeKeyframes:
         for start in range(0, length, ENTRY_EVERY):
             first = max(int(np.searchsorted(decisions, start, side="right")) - 1, 0)
             visited = [start, *decisions[first + 1 :].tolist()]
-            chains.append(
-                [Link(frame, first + place, place) for place, frame in enumerate(visited)]
-            )
+            chain = [Link(frame, first + place, place) for place, frame in enumerate(visited)]
+            chains.append(chain)
         return chains
 
     def shots(self, frames: list[int]) -> list[list[Shot]]:
@@ -184,14 +182,11 @@ class EpisodeKeyframes:
         readings: dict[str, np.ndarray] = {}
         for camera in robot.cameras:
             c = CAMERAS.index(camera.name)
-            beside = (
-                arrays["depth"][at, c][..., None].astype(np.float32),
-                arrays["extrinsic"][at, c].astype(np.float32),
-            )
-            readings |= {
-                camera.name: arrays["colours"][at, c],
-                **dict(zip(camera.readings, beside, strict=False)),
-            }
+            readings[camera.name] = arrays["colours"][at, c]
+            if camera.depth:
+                depth, pose = camera.readings
+                readings[depth] = arrays["depth"][at, c][..., None].astype(np.float32)
+                readings[pose] = arrays["extrinsic"][at, c].astype(np.float32)
         return readings
 
     def commanded_open(self, frames: list[int]) -> np.ndarray:
@@ -318,17 +313,17 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         number, episode, keyframes, links = self.window(index)
         frames = [link.frame for link in links]
+        # one goal for the whole chain, or an error that names them
+        goal = self.sources[number].goal(episode)
         sample = KeyframeSample(
-            goal=self.sources[number].goal(
-                episode
-            ),  # one for the whole chain, or an error that names them
+            goal=goal,
             shots=keyframes.shots(frames),
             open=keyframes.commanded_open(frames),
             places=np.array([link.place for link in links]),
             targets=keyframes.motions.targets[[link.motion for link in links]],
         )
         item = self.processor.item(sample)
-        return item | {"goal": sample.goal, "subgoals": {}, "place": (number, episode, frames[0])}
+        return item | {"goal": goal, "subgoals": {}, "place": (number, episode, frames[0])}
 
 
 @TRAINING_SETS.register("keyframes")

@@ -201,16 +201,12 @@ class MultiViewTransformer(nn.Module):
         alone = len(self.layers) // 2
         views = views.reshape(batch * VIEWS, grid**2, -1)
         for layer in self.layers[:alone]:
-            views = self._run(layer, views)
+            views = run_layer(layer, views, how=self.recomputed)
         x = torch.cat([language, views.reshape(batch, VIEWS * grid**2, -1)], 1)
         for layer in self.layers[alone:]:
-            x = self._run(layer, x)
+            x = run_layer(layer, x, how=self.recomputed)
         tokens = self.narrow(x[:, words:]).reshape(batch * VIEWS, grid**2, -1)
         return tokens.transpose(1, 2).unflatten(-1, (grid, grid))
-
-    def _run(self, layer: nn.Module, x: Tensor) -> Tensor:
-        out: Tensor = run_layer(layer, x, how=self.recomputed)
-        return out
 
 
 class HeatmapDecoder(nn.Module):
@@ -381,7 +377,8 @@ class SAM2ActNetwork(nn.Module):
         tokens = self.coarse.transformer(views)
         positions = released_positions(self.coarse.transformer.positions, batch)
         rows = torch.arange(batch * VIEWS, device=tokens.device).view(-1, length, VIEWS)
-        remembered, decoded = self.memory.init_state(), []
+        remembered = self.memory.init_state()
+        decoded = []
         for step in range(length):
             now = rows[:, step].flatten()
             maps = (views.maps[0][now], views.maps[1][now], views.maps[2][now])

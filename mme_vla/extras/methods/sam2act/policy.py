@@ -51,17 +51,6 @@ _CLOSE_TO_EDGE = 1e-3  # metres that a shifted target keeps from the bounds
 _BIN_OFFSETS = (-2, 2)  # how far off the bins given to the heads; the upper end is left out
 
 
-def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -> Noise:
-    """Random numbers of `count` samples: shifts and turns in [−1, 1], and the offsets of the given
-    bins.
-    """
-    return {
-        "shift": 2 * torch.rand(count, keyframes, 3, generator=generator) - 1,
-        "turn": 2 * torch.rand(count, keyframes, generator=generator) - 1,
-        "told": torch.randint(*_BIN_OFFSETS, (count, keyframes, 3), generator=generator),
-    }
-
-
 @dataclass(frozen=True)
 class Scenes:
     """A batch after augmentation, b·k keyframes one after the other; the points are in
@@ -90,13 +79,13 @@ def augmented(
 
     Args:
         language: [b, l, w] tokens of the goals.
-        noise: as `augmentation_draws` makes them; None changes nothing.
+        noise: as `SAM2ActPolicy.training_noise` makes them; None changes nothing.
         bins: of a whole turn.
     """
     keyframes = batch.points.shape[1]
-    points, target, rotation = (
-        x.flatten(0, 1) for x in (batch.points, batch.target, batch.rotation)
-    )
+    points = batch.points.flatten(0, 1)
+    target = batch.target.flatten(0, 1)
+    rotation = batch.rotation.flatten(0, 1)
     if noise is not None:
         low, high = target.new_tensor(cube.low), target.new_tensor(cube.high)
         shift = noise["shift"].flatten(0, 1).to(target) * SHIFT * (high - low)
@@ -133,17 +122,16 @@ def first_loss(
     fine, tokens = network.fine_step(network.encode_views(near, scenes.state, scenes.language))
     here = torch.zeros_like(centre)  # the waypoint, in the closer look's cube
     maps = torch.cat([heatmap_loss(coarse, centre), heatmap_loss(fine, here)], 1)
-    noisy_bins = (
-        scenes.bins if offsets is None else (scenes.bins + offsets) % network.sizes.rotation_bins
-    )
-    outputs = network.heads(tokens, here, noisy_bins)
+    given = scenes.bins
+    if offsets is not None:
+        given = (given + offsets) % network.sizes.rotation_bins
+    outputs = network.heads(tokens, here, given)
     entropy = nn.functional.cross_entropy
     return {
         "heatmap": maps.mean(),
-        **{
-            f"rotation_{axis}": entropy(outputs[axis], scenes.bins[:, i])
-            for i, axis in enumerate("xyz")
-        },
+        "rotation_x": entropy(outputs["x"], scenes.bins[:, 0]),
+        "rotation_y": entropy(outputs["y"], scenes.bins[:, 1]),
+        "rotation_z": entropy(outputs["z"], scenes.bins[:, 2]),
         "gripper": entropy(outputs["gripper"], scenes.gripper),
         "collision": entropy(outputs["collision"], scenes.collision),
     }
@@ -254,8 +242,15 @@ class SAM2ActPolicy(NetworkPolicy):
     # Training
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
-        """Shifts and turns of `count` samples' clouds, and offsets of the given rotations."""
-        return augmentation_draws(count, self.keyframes, generator)
+        """Shifts and turns of `count` samples' clouds in [−1, 1], and offsets of the given
+        rotations' bins.
+        """
+        shape = (count, self.keyframes)
+        return {
+            "shift": 2 * torch.rand(*shape, 3, generator=generator) - 1,
+            "turn": 2 * torch.rand(shape, generator=generator) - 1,
+            "told": torch.randint(*_BIN_OFFSETS, (*shape, 3), generator=generator),
+        }
 
     def forward(
         self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None
@@ -278,20 +273,19 @@ class SAM2ActPolicy(NetworkPolicy):
                 logits = self.backbone.coarse_sequences(views, batch.points.shape[1])
                 parts = {"heatmap": heatmap_loss(logits, scenes.target).mean()}
         loss = torch.stack(list(parts.values())).sum()
-        return loss, {
-            "loss": loss.detach(),
-            **{name: part.detach() for name, part in parts.items()},
-        }
+        metrics = {"loss": loss.detach()}
+        for name, part in parts.items():
+            metrics[name] = part.detach()
+        return loss, metrics
 
     def recompute(self, mode: Recompute) -> None:
         self.backbone.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        stages = (self.backbone.coarse, self.backbone.fine)
-        layers = [
-            ShardGroup(layer) for stage in stages for layer in stacked_layers(stage.transformer)
-        ]
-        return [ShardGroup(self.backbone.encoder, full=True), *layers]
+        groups = [ShardGroup(self.backbone.encoder, full=True)]
+        for branch in (self.backbone.coarse, self.backbone.fine):
+            groups += map(ShardGroup, stacked_layers(branch.transformer))
+        return groups
 
     # Sampling
 
@@ -306,16 +300,16 @@ class SAM2ActPolicy(NetworkPolicy):
         remembered.
         """
         waypoints = []
-        for i in range(len(batch.points)):
-            state = BankState()
-            colours = batch.colours[i].float() / 255
-            scenes = [
-                SceneInputs(batch.points[i, k], colours[k], batch.state[i, k], batch.language[i])
-                for k in range(batch.points.shape[1])
-            ]
-            for earlier in scenes[:-1]:
-                state = self.watch(earlier, state)
-            waypoints.append(self._decide(scenes[-1], state)[0])
+        colours = batch.colours.float() / 255
+        last = batch.points.shape[1] - 1
+        for i, points in enumerate(batch.points):
+            remembered = BankState()
+            for k in range(last + 1):
+                scene = SceneInputs(points[k], colours[i, k], batch.state[i, k], batch.language[i])
+                if k < last:
+                    remembered = self.watch(scene, remembered)
+                else:
+                    waypoints.append(self._decide(scene, remembered)[0])
         return torch.stack(waypoints)[:, None]
 
     def watch(self, scene: SceneInputs, remembered: BankState) -> BankState:
@@ -324,10 +318,9 @@ class SAM2ActPolicy(NetworkPolicy):
             return watch(self.backbone, scene.to(self.device), remembered, self.cube)
 
     def _decide(self, scene: SceneInputs, remembered: BankState) -> tuple[Tensor, BankState]:
-        cube = self.cube
         with self.autocast():
             finder = _point_finder(self.backbone.sizes.side, self.device)
-            return decide(self.backbone, scene.to(self.device), remembered, cube, finder)
+            return decide(self.backbone, scene.to(self.device), remembered, self.cube, finder)
 
     # Episodes
 
@@ -335,9 +328,11 @@ class SAM2ActPolicy(NetworkPolicy):
         return KeyframeEpisode(self, goal, seed)
 
     def observation(self, episodes: "Sequence[Episode]") -> list[SceneInputs]:
-        return [
-            episode.scene_inputs() for episode in episodes if isinstance(episode, KeyframeEpisode)
-        ]
+        scenes = []
+        for episode in episodes:
+            assert isinstance(episode, KeyframeEpisode)
+            scenes.append(episode.scene_inputs())
+        return scenes
 
     def predict_chunk(
         self,

@@ -29,7 +29,7 @@ from mme_vla.extras.methods.sam2act.geometry import (
     virtual_images,
 )
 from mme_vla.processing.base import STATS_FILE, SampleSpec
-from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import TensorStruct
 
@@ -139,10 +139,12 @@ def _render_images(points: Tensor, colours: Tensor, inside: Tensor, side: int) -
     blank = torch.zeros(VIEWS, 7, side, side, device=points.device)
     blank[:, 6] = EMPTY
     nothing = torch.cat([blank, constant_channels(side, points.device)], 1)
-    images = [
-        virtual_images(cloud[mask], paint[mask], side) if mask.any() else nothing
-        for cloud, paint, mask in zip(points, colours, inside, strict=True)
-    ]
+    images = []
+    for cloud, paint, mask in zip(points, colours, inside, strict=True):
+        seen = nothing
+        if mask.any():
+            seen = virtual_images(cloud[mask], paint[mask], side)
+        images.append(seen)
     return torch.stack(images)
 
 
@@ -255,12 +257,9 @@ class SAM2ActProcessor(GoalProcessor):
         for name, value in sizes.items():
             check_integer(f"processor.{name}", value, LARGEST)
         numbers = list(bounds)
-        finite = len(numbers) == 6 and all(
-            isinstance(n, int | float) and np.isfinite(n) for n in numbers
-        )
+        finite = all(isinstance(n, int | float) and np.isfinite(n) for n in numbers)
         require(
-            finite
-            and not any(low >= high for low, high in zip(numbers[:3], numbers[3:], strict=True)),
+            len(numbers) == 6 and finite and np.less(numbers[:3], numbers[3:]).all(),
             f"processor.bounds={brief(numbers)} must be x, y, z of the lowest corner, then the"
             " highest.",
         )
@@ -285,11 +284,8 @@ class SAM2ActProcessor(GoalProcessor):
             HashedTokens(language, words) if text == HASHED else ClipTokens(language, words, text)
         )
         self.side, self.cube = side, Cube.of(numbers)
-        self.trained_waypoints, self.waypoints, self.video_frames = (
-            trained_waypoints,
-            waypoints,
-            video_frames,
-        )
+        self.trained_waypoints, self.waypoints = trained_waypoints, waypoints
+        self.video_frames = video_frames
         self.field_of_view = float(field_of_view)
         self.stats = stats
 
@@ -306,7 +302,7 @@ class SAM2ActProcessor(GoalProcessor):
     def require_stats(self) -> NormStats:
         """Statistics that change nothing, where none were computed: this policy reads none."""
         robot = self.embodiment
-        return self._stats or NormStats(_neutral(robot.state.width), _neutral(robot.action.width))
+        return self._stats or NormStats.unit(robot.state.width, robot.action.width)
 
     # Observations
 
@@ -341,9 +337,8 @@ class SAM2ActProcessor(GoalProcessor):
     def cloud(self, shots: Sequence[Shot]) -> tuple[Tensor, Tensor]:
         """Points [n, 3] in metres, and their colours [n, 3] in [0, 1]."""
         points, colours = cloud_of(shots, self.side)
-        return torch.from_numpy(points), torch.from_numpy(
-            np.ascontiguousarray(colours)
-        ).float() / 255
+        painted = torch.from_numpy(np.ascontiguousarray(colours)).float() / 255
+        return torch.from_numpy(points), painted
 
     def clock(self, place: int, waypoints: int) -> float:
         """Time from 1 down to −1, of the `place`-th of `waypoints` keyframes; it stays at −1 past
@@ -358,12 +353,6 @@ class SAM2ActProcessor(GoalProcessor):
             [opened, finger, finger, self.clock(place, self.waypoints)], dtype=torch.float32
         )
 
-    def commanded_state(self, opened: bool, place: int) -> Tensor:
-        """The same in training, where fingers are synthetic from the command, as released."""
-        finger = FINGER_OPEN if opened else 0.0
-        clock = self.clock(place, self.trained_waypoints)
-        return torch.tensor([float(opened), finger, finger, clock], dtype=torch.float32)
-
     # Actions
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
@@ -377,16 +366,22 @@ class SAM2ActProcessor(GoalProcessor):
     # Batches
 
     def item(self, sample: Recorded) -> dict[str, Any]:
-        clouds = [cloud_of(shots, self.side) for shots in sample.shots]
+        points, colours, states = [], [], []
+        for shots, is_open, place in zip(sample.shots, sample.open, sample.places, strict=True):
+            places, paint = cloud_of(shots, self.side)
+            points.append(places)
+            colours.append(paint)
+            # As `state`, but for the fingers: in training they are synthetic from the command, as
+            # released.
+            finger = FINGER_OPEN if is_open else 0.0
+            clock = self.clock(int(place), self.trained_waypoints)
+            states.append([float(is_open), finger, finger, clock])
         targets = np.asarray(sample.targets, np.float32)
-        states = []
-        for is_open, place in zip(sample.open, sample.places, strict=True):
-            states.append(self.commanded_state(bool(is_open), int(place)))
         rotation = Rotation.from_euler("xyz", targets[:, 3:6]).as_quat().astype(np.float32)
         return {
-            "points": torch.from_numpy(np.stack([points for points, _ in clouds])),
-            "colours": torch.from_numpy(np.stack([colours for _, colours in clouds])),
-            "state": torch.stack(states),
+            "points": torch.from_numpy(np.stack(points)),
+            "colours": torch.from_numpy(np.stack(colours)),
+            "state": torch.tensor(states, dtype=torch.float32),
             "language": self.prompt(sample.goal),
             "target": torch.from_numpy(targets[:, :3]),
             "rotation": torch.from_numpy(rotation),
@@ -418,8 +413,3 @@ class SAM2ActProcessor(GoalProcessor):
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
         }
-
-
-def _neutral(width: int) -> QuantileStats:
-    zeros, ones = np.zeros(width), np.ones(width)
-    return QuantileStats(mean=zeros, std=ones, q01=-ones, q99=ones.copy())

@@ -28,14 +28,10 @@ class LoraProjection(nn.Module):
         super().__init__()
         width = qkv.in_features
         self.qkv = qkv
-        self.linear_a_q, self.linear_b_q = (
-            nn.Linear(width, rank, bias=False),
-            nn.Linear(rank, width, bias=False),
-        )
-        self.linear_a_v, self.linear_b_v = (
-            nn.Linear(width, rank, bias=False),
-            nn.Linear(rank, width, bias=False),
-        )
+        self.linear_a_q = nn.Linear(width, rank, bias=False)
+        self.linear_b_q = nn.Linear(rank, width, bias=False)
+        self.linear_a_v = nn.Linear(width, rank, bias=False)
+        self.linear_b_v = nn.Linear(rank, width, bias=False)
         for first, second in (
             (self.linear_a_q, self.linear_b_q),
             (self.linear_a_v, self.linear_b_v),
@@ -213,10 +209,8 @@ class MemoryLayer(nn.Module):
     def __init__(self, width: int, memory: int, inner: int) -> None:
         super().__init__()
         self.self_norm, self.self_attention = nn.LayerNorm(width), RotaryAttention(width, width)
-        self.memory_norm, self.memory_attention = (
-            nn.LayerNorm(width),
-            RotaryAttention(width, memory),
-        )
+        self.memory_norm = nn.LayerNorm(width)
+        self.memory_attention = RotaryAttention(width, memory)
         self.feed_norm = nn.LayerNorm(width)
         self.into, self.back = nn.Linear(width, inner), nn.Linear(inner, width)
 

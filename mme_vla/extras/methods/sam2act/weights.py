@@ -118,12 +118,12 @@ def released_names(targets: Iterable[str], mask_stages: int) -> NameTable:
 
 def released_copies(names: Iterable[str]) -> dict[str, str]:
     """Copy → original: the branches' own copies of every tensor of SAM2's."""
-    return {
-        f"{branch}.{name}": name
-        for name in names
-        if name.startswith(IMAGE_PREFIX)
-        for branch in BRANCHES
-    }
+    copies = {}
+    for name in names:
+        if name.startswith(IMAGE_PREFIX):
+            for branch in BRANCHES:
+                copies[f"{branch}.{name}"] = name
+    return copies
 
 
 def released_unread(width: int = 256) -> list[Unread]:
@@ -132,11 +132,8 @@ def released_unread(width: int = 256) -> list[Unread]:
     Args:
         width: of SAM2's own tokens.
     """
-    return [Unread(f"{IMAGE_PREFIX}{name}", shape) for name, shape in _unread_shapes(width).items()]
-
-
-def _unread_shapes(width: int) -> Mapping[str, tuple[int, ...]]:
-    small, half, inner, tokens = width // 4, width // 2, 8 * width, 4
+    half, small, eighth = width // 2, width // 4, width // 8
+    tokens = 4  # of the mask decoder
     shapes: dict[str, tuple[int, ...]] = {
         "no_mem_embed": (1, 1, width),
         "no_mem_pos_enc": (1, 1, width),
@@ -146,52 +143,49 @@ def _unread_shapes(width: int) -> Mapping[str, tuple[int, ...]]:
         **_layer("obj_ptr_tpos_proj", small, width),
     }
     prompt = "sam_prompt_encoder"
-    shapes |= {f"{prompt}.pe_layer.positional_encoding_gaussian_matrix": (2, half)}
-    shapes |= {f"{prompt}.point_embeddings.{i}.weight": (1, width) for i in range(4)}
-    shapes |= {
-        f"{prompt}.{name}.weight": (1, width) for name in ("not_a_point_embed", "no_mask_embed")
-    }
+    shapes[f"{prompt}.pe_layer.positional_encoding_gaussian_matrix"] = (2, half)
+    embeddings = [f"point_embeddings.{i}" for i in range(4)]
+    for name in (*embeddings, "not_a_point_embed", "no_mask_embed"):
+        shapes[f"{prompt}.{name}.weight"] = (1, width)
     for step, (out, into, side) in {0: (4, 1, 2), 3: (16, 4, 2), 6: (width, 16, 1)}.items():
         shapes |= _layer(f"{prompt}.mask_downscaling.{step}", out, into, side, side)
     for step, channels in {1: 4, 4: 16}.items():
-        shapes |= _norm(f"{prompt}.mask_downscaling.{step}", channels)
+        shapes |= _layer(f"{prompt}.mask_downscaling.{step}", channels)
     decoder = "sam_mask_decoder"
-    shapes |= {f"{decoder}.{name}.weight": (1, width) for name in ("iou_token", "obj_score_token")}
-    shapes |= {f"{decoder}.mask_tokens.weight": (tokens, width)}
+    for name, count in {"iou_token": 1, "obj_score_token": 1, "mask_tokens": tokens}.items():
+        shapes[f"{decoder}.{name}.weight"] = (count, width)
     for layer in range(2):
         place = f"{decoder}.transformer.layers.{layer}"
         shapes |= _attention(f"{place}.self_attn", width, width)
         for name in ("cross_attn_token_to_image", "cross_attn_image_to_token"):
             shapes |= _attention(f"{place}.{name}", width, half)
-        shapes |= _layers(f"{place}.mlp.layers", [width, inner, width])
+        shapes |= _layers(f"{place}.mlp.layers", [width, 8 * width, width])
         for number in range(1, 5):
-            shapes |= _norm(f"{place}.norm{number}", width)
+            shapes |= _layer(f"{place}.norm{number}", width)
     shapes |= _attention(f"{decoder}.transformer.final_attn_token_to_image", width, half)
-    shapes |= _norm(f"{decoder}.transformer.norm_final_attn", width)
-    eighth = width // 8
+    shapes |= _layer(f"{decoder}.transformer.norm_final_attn", width)
     for step, (into, out) in {0: (width, small), 3: (small, eighth)}.items():
         name = f"{decoder}.output_upscaling.{step}"
         shapes |= {f"{name}.weight": (into, out, 2, 2), f"{name}.bias": (out,)}
-    shapes |= _norm(f"{decoder}.output_upscaling.1", small)
+    shapes |= _layer(f"{decoder}.output_upscaling.1", small)
     for token in range(tokens):
-        shapes |= _layers(
-            f"{decoder}.output_hypernetworks_mlps.{token}.layers", [width, width, width, eighth]
-        )
+        name = f"{decoder}.output_hypernetworks_mlps.{token}.layers"
+        shapes |= _layers(name, [width, width, width, eighth])
     shapes |= _layers(f"{decoder}.iou_prediction_head.layers", [width, width, width, tokens])
-    return shapes | _layers(f"{decoder}.pred_obj_score_head.layers", [width, width, width, 1])
+    shapes |= _layers(f"{decoder}.pred_obj_score_head.layers", [width, width, width, 1])
+    return [Unread(f"{IMAGE_PREFIX}{name}", shape) for name, shape in shapes.items()]
 
 
-def _layer(name: str, out: int, into: int, *kernel: int) -> dict[str, tuple[int, ...]]:
-    return {f"{name}.weight": (out, into, *kernel), f"{name}.bias": (out,)}
+def _layer(name: str, out: int, *inputs: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of a linear layer, a convolution, or (without inputs) a norm."""
+    return {f"{name}.weight": (out, *inputs), f"{name}.bias": (out,)}
 
 
 def _layers(name: str, widths: list[int]) -> dict[str, tuple[int, ...]]:
-    pairs = enumerate(itertools.pairwise(widths))
-    return {key: shape for i, (a, b) in pairs for key, shape in _layer(f"{name}.{i}", b, a).items()}
-
-
-def _norm(name: str, width: int) -> dict[str, tuple[int, ...]]:
-    return {f"{name}.weight": (width,), f"{name}.bias": (width,)}
+    shapes: dict[str, tuple[int, ...]] = {}
+    for i, (into, out) in enumerate(itertools.pairwise(widths)):
+        shapes |= _layer(f"{name}.{i}", out, into)
+    return shapes
 
 
 def _attention(name: str, width: int, inner: int) -> dict[str, tuple[int, ...]]:
@@ -233,9 +227,9 @@ def sam2act_adapter(policy: Policy) -> Adapter:
     sizes = policy.backbone.sizes
     table = released_names(policy.backbone.state_dict(), sizes.mask_stages)
     unread = released_unread(sizes.encoder.neck)
-    originals = [piece.path for pieces in table.values() for piece in pieces] + [
-        gap.path for gap in unread
-    ]
+    originals = [gap.path for gap in unread]
+    for pieces in table.values():
+        originals += [piece.path for piece in pieces]
     rates = Derived(RATES, lambda: code_rates(sizes.feature)[None])  # of the rotation bins' codes
     return Adapter(prefixed("backbone", table), unread, released_copies(originals), [rates])
 

@@ -8,6 +8,7 @@ new window whole. What does not depend on the newest frames is read between two 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -114,13 +115,14 @@ class VideoEpisode(Episode):
 
     def images_of(self, pairs: Sequence[Pair]) -> Tensor:
         """Temporal patches [n, 2, 3, h, w] uint8 of frames that were observed."""
-        missing = sorted({frame for pair in pairs for frame in pair} - set(self.video.frames))
+        shown = list(chain.from_iterable(pairs))
+        missing = sorted(set(shown) - set(self.video.frames))
         if missing:
             raise UserError(
                 f"The video shows the frames {missing[:5]}, which were not rendered or not"
                 " observed: observe() those that frames_read() names."
             )
-        frames = torch.stack([self.video.frames[frame] for pair in pairs for frame in pair])
+        frames = torch.stack([self.video.frames[frame] for frame in shown])
         return self._policy.require_processor().video(frames)
 
     def encode(self, model: VideoLanguageModel, pairs: Sequence[Pair]) -> Tensor:
@@ -136,7 +138,7 @@ class VideoEpisode(Episode):
         rendered.
         """
         pairs = self.pairs(step)
-        rendered = all(frame in self.video.frames for pair in pairs[:-1] for frame in pair)
+        rendered = self.video.frames.keys() >= set(chain.from_iterable(pairs[:-1]))
         if not tokens.prefix or not rendered:
             return False
         self.video.ahead = Ahead(step, pairs, tokens, model.new_cache())
@@ -154,11 +156,10 @@ class VideoEpisode(Episode):
         features = self.encode(model, ahead.pairs[ahead.patches : last])
         kinds = torch.from_numpy(tokens.kinds) == VIDEO
         end = int(torch.nonzero(kinds)[last * features.shape[1] - 1]) + 1
-        place, device = slice(ahead.length, end), features.device
-        ids, positions = (
-            torch.from_numpy(x[..., place].copy()).to(device)[None]
-            for x in (tokens.ids, tokens.positions)
-        )
+        place = slice(ahead.length, end)
+        device = features.device
+        ids = torch.from_numpy(tokens.ids[place].copy()).to(device)[None]
+        positions = torch.from_numpy(tokens.positions[:, place].copy()).to(device)[None]
         embedded = model.embed(ids, (kinds[place][None].to(device), features.flatten(0, 1)))
         model.hidden(embedded, positions, ahead.cache)
         ahead.patches, ahead.length = last, end

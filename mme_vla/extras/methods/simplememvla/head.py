@@ -196,10 +196,7 @@ class ActionHead(nn.Module):
         self.rotary = Rotary(width // sizes.heads, sizes)
         self.blocks = nn.ModuleList(HeadBlock(sizes) for _ in range(sizes.depth))
         self.final_layer = FinalLayer(width, action_dim)
-        self._initialise()
-
-    def _initialise(self) -> None:
-        """Modulations and output begin at zero, types and positions at a deviation of 0.02."""
+        # Modulations and output begin at zero, types and positions at a deviation of 0.02.
         for name, parameter in self.named_parameters():
             if name.endswith("_type") or name == "action_pos":
                 nn.init.normal_(parameter, std=0.02)
@@ -217,10 +214,15 @@ class ActionHead(nn.Module):
         if condition.tokens is not None:
             words = words + self.condition_token_proj(condition.tokens)
         end = condition.positions.masked_fill(~condition.mask[:, None], 0).amax((1, 2))
-        parts, masks, positions, count = [words], [condition.mask], [condition.positions], 0
+        parts, masks, positions = [words], [condition.mask], [condition.positions]
+        count = 0
         if self.state_proj is not None and state is not None:
             parts.append(self.state_proj(state.to(words.dtype))[:, None] + self.state_type)
-            masks.append(self._state_mask(state))
+            is_read = torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
+            if self.training and self.sizes.state_dropout:
+                chances = torch.rand(len(state), 1, device=state.device)
+                is_read = chances >= self.sizes.state_dropout
+            masks.append(is_read)
             positions.append((end + 1)[:, None, None].expand(-1, 3, 1))
             count = 1
         steps = torch.arange(x.shape[1], device=x.device)
@@ -232,15 +234,6 @@ class ActionHead(nn.Module):
         positions.append((end[:, None] + 1 + count + steps)[:, None].expand(-1, 3, -1))
         masks.append(torch.ones(x.shape[:2], dtype=torch.bool, device=x.device))
         return torch.cat([*parts, actions], 1), torch.cat(positions, 2), torch.cat(masks, 1)
-
-    def _state_mask(self, state: Tensor) -> Tensor:
-        """Whether each state [b, s] is read, [b, 1]: all of them unless trained with
-        `state_dropout`.
-        """
-        share = self.sizes.state_dropout if self.training else 0.0
-        if not share:
-            return torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
-        return torch.rand(len(state), 1, device=state.device) >= share
 
     def forward(
         self, x: Tensor, time: Tensor, condition: Condition, state: Tensor | None

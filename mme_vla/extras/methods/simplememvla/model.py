@@ -45,21 +45,20 @@ class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):
         if fresh or hidden_states.shape[1] == 1:
             read: Tensor = super().forward(hidden_states, cache_params, attention_mask, **options)
             return read
-        count, kernel, layer = (
-            hidden_states.shape[1],
-            self.conv_kernel_size,
-            cache_params.layers[self.layer_idx],
-        )
+        count = hidden_states.shape[1]
+        layer = cache_params.layers[self.layer_idx]
         state = layer.recurrent_states
         new = self.in_proj_qkv(hidden_states).transpose(1, 2)
         columns = torch.cat([layer.conv_states.to(new), new], -1)
-        cache_params.update_conv_state(columns[..., -kernel:].clone(), self.layer_idx)
+        recent = columns[..., -self.conv_kernel_size :].clone()
+        cache_params.update_conv_state(recent, self.layer_idx)
         mixed = functional.conv1d(columns[..., 1:], self.conv1d.weight, groups=self.conv_dim)
         mixed = functional.silu(mixed[..., -count:]).transpose(1, 2)
         q, k, v = mixed.split([self.key_dim, self.key_dim, self.value_dim], -1)
-        q, k = (x.unflatten(-1, (-1, self.head_k_dim)) for x in (q, k))
-        if (repeats := self.num_v_heads // self.num_k_heads) > 1:
-            q, k = (x.repeat_interleave(repeats, 2) for x in (q, k))
+        q, k = q.unflatten(-1, (-1, self.head_k_dim)), k.unflatten(-1, (-1, self.head_k_dim))
+        repeats = self.num_v_heads // self.num_k_heads
+        if repeats > 1:
+            q, k = q.repeat_interleave(repeats, 2), k.repeat_interleave(repeats, 2)
         decay = functional.softplus(self.in_proj_a(hidden_states).float() + self.dt_bias)
         read, state = self.chunk_gated_delta_rule(
             q,
@@ -114,9 +113,8 @@ class VideoLanguageModel(nn.Module):
         self.model = Qwen3_5Model(config)
         for layer in self.model.language_model.layers:
             if hasattr(layer, "linear_attn"):
-                layer.linear_attn.__class__ = (
-                    ContinuedDeltaNet  # the same weights, with another forward
-                )
+                # the same weights, with another forward
+                layer.linear_attn.__class__ = ContinuedDeltaNet
         self.reset_buffers()
 
     def reset_buffers(self) -> None:
@@ -233,10 +231,10 @@ class VideoLanguageModel(nn.Module):
             if words is None:
                 likeliest = logits.argmax(-1).tolist()
             else:
-                step = len(hidden)
-                likeliest = [
-                    word_ids[step] if step < len(word_ids) else ends.end for word_ids in words
-                ]
+                likeliest = []
+                for word_ids in words:
+                    given = [*word_ids, ends.end]
+                    likeliest.append(given[min(len(hidden), len(word_ids))])
             inputs = []
             for response, tail, word in zip(responses, tails, likeliest, strict=True):
                 if tail or word == ends.end or len(response) == limit:
@@ -279,9 +277,8 @@ def words_loss(
     rows = [(i, place) for i, (start, end) in enumerate(spans) for place in range(start, end)]
     row, place = torch.tensor(rows, device=hidden.device).T
     logits, targets = model.logits(hidden[row, place - 1]), ids[row, place]
-    return functional.cross_entropy(logits, targets), (
-        logits.detach().argmax(-1) == targets
-    ).float().mean()
+    right = (logits.detach().argmax(-1) == targets).float().mean()
+    return functional.cross_entropy(logits, targets), right
 
 
 def response_condition(

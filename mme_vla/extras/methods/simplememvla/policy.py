@@ -335,14 +335,10 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             start = 0
             if prefill is not None:
                 start = prefill.length
-            rows = [
-                functional.pad(e[:n], (0, 0, longest - n, 0))
-                for e, n in zip(embedded, batch.prompts, strict=True)
-            ]
-            places = [
-                functional.pad(p[:, :n], (longest - n, 0))
-                for p, n in zip(batch.positions, batch.prompts, strict=True)
-            ]
+            rows, places = [], []
+            for row, place, length in zip(embedded, batch.positions, batch.prompts, strict=True):
+                rows.append(functional.pad(row[:length], (0, 0, longest - length, 0)))
+                places.append(functional.pad(place[:, :length], (longest - length, 0)))
             mask = None
             if min(batch.prompts) < longest:
                 lengths = torch.tensor(batch.prompts, device=embedded.device)
@@ -528,14 +524,17 @@ def _augmented(
     video: Tensor | None, images: Tensor, patches: Sequence[int], changes: Tensor
 ) -> tuple[Tensor | None, Tensor]:
     """The video [K, 2, 3, H, W] and the images [b, c, 3, H, W] of each row, all changed alike."""
-    draws = [augmentation_draw(row) for row in changes.tolist()]
-    changed = [augment(row, draw) for row, draw in zip(images, draws, strict=True)]
-    if video is not None:
-        parts = []
-        for part, draw in zip(video.split(list(patches)), draws, strict=True):
-            parts.append(augment(part.flatten(0, 1), draw).unflatten(0, (-1, TEMPORAL)))
-        video = torch.cat(parts)
-    return video, torch.stack(changed)
+    videos = None if video is None else video.split(list(patches))
+    changed_images, changed_videos = [], []
+    for i, row in enumerate(changes.tolist()):
+        draw = augmentation_draw(row)
+        changed_images.append(augment(images[i], draw))
+        if videos is not None:
+            frames = augment(videos[i].flatten(0, 1), draw)
+            changed_videos.append(frames.unflatten(0, (-1, TEMPORAL)))
+    if changed_videos:
+        video = torch.cat(changed_videos)
+    return video, torch.stack(changed_images)
 
 
 def _video_episode(episode: Episode) -> VideoEpisode:

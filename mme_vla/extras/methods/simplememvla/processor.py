@@ -315,10 +315,10 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         return _standardise(states, self.require_stats().state)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
-        raw = self.embodiment.action.to_relative(
-            *(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
-        )
-        return _standardise(raw, self.require_stats().actions)
+        raw = torch.as_tensor(chunk, dtype=torch.float32)
+        at = torch.as_tensor(state, dtype=torch.float32)
+        relative = self.embodiment.action.to_relative(raw, at)
+        return _standardise(relative, self.require_stats().actions)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
         mean, deviation = _moments(self.require_stats().actions, chunk.float())
@@ -334,14 +334,16 @@ class SimpleMemVlaProcessor(PolicyProcessor):
                 "SimpleMemVLA learns to generate the current sub-task: set subgoal_text.kind to"
                 " simple_subgoal or grounded_subgoal."
             )
-        robot, state = self.embodiment, torch.from_numpy(sample.states[-1])
+        robot = self.embodiment
+        state = torch.from_numpy(sample.states[-1])
         video = self.video(channels_first(sample.views[robot.memory_camera]))
-        views = [
-            sample.views[name][-1] for name in robot.camera_names if name != robot.memory_camera
-        ]
-        images = (
-            self.images(views) if views else torch.zeros(0, *video.shape[2:], dtype=torch.uint8)
-        )
+        views = []
+        for name in robot.camera_names:
+            if name != robot.memory_camera:
+                views.append(sample.views[name][-1])
+        images = torch.zeros(0, *video.shape[2:], dtype=torch.uint8)
+        if views:
+            images = self.images(views)
         response = clean_response(sample.subgoal)
         tokens = self.tokens(
             self.prompt(sample.goal), len(video), _side(video), _side(images), response
@@ -381,8 +383,11 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         longest = max(len(one.ids) for one in tokens)
 
         def padded(name: str) -> Tensor:
-            rows = [torch.from_numpy(np.ascontiguousarray(getattr(one, name))) for one in tokens]
-            return torch.stack([functional.pad(row, (0, longest - row.shape[-1])) for row in rows])
+            rows = []
+            for one in tokens:
+                row = torch.from_numpy(np.ascontiguousarray(getattr(one, name)))
+                rows.append(functional.pad(row, (0, longest - row.shape[-1])))
+            return torch.stack(rows)
 
         return VideoBatch(
             ids=padded("ids"),

@@ -209,9 +209,9 @@ class CameraTokens:
             inside = "<|image_pad|>" * count
         else:
             patch = f"<|vision_start|>{'<|video_pad|>' * count}<|vision_end|>"
-            inside = "<|video_pad|>" * self.memory + "".join(
-                timestamp(time) + patch for time in self.times
-            )
+            inside = "<|video_pad|>" * self.memory
+            for time in self.times:
+                inside += timestamp(time) + patch
         return f"{label}:<|vision_start|>{inside}<|vision_end|>"
 
 

@@ -198,10 +198,11 @@ class SubtaskPolicy(MMEPolicy):
 
     def _context(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Embeddings [b, n, d] of current images and prompt, and their mask [b, n]."""
-        blocks = self.backbone.embed(self.model.prepare_images(batch))
-        return torch.cat([block.tokens for block in blocks], 1), torch.cat(
-            [block.mask for block in blocks], 1
-        )
+        tokens, masks = [], []
+        for block in self.backbone.embed(self.model.prepare_images(batch)):
+            tokens.append(block.tokens)
+            masks.append(block.mask)
+        return torch.cat(tokens, 1), torch.cat(masks, 1)
 
     def forward(self, batch: Batch, *args: Any, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
         """The action's loss under the recorded words, and the weighted cross entropy of these.
@@ -224,9 +225,9 @@ class SubtaskPolicy(MMEPolicy):
         losses = (
             functional.cross_entropy(logits.transpose(1, 2), batch.words, reduction="none") * mask
         )
-        words = (
-            losses if batch.weight is None else losses * batch.weight[:, None]
-        ).sum() / mask.sum()
+        if batch.weight is not None:
+            losses = losses * batch.weight[:, None]
+        words = losses.sum() / mask.sum()
         memory = MemoryTokens(hidden[:, 1:], mask)
         action, metrics = super().forward(batch, *args, **{**options, "memory": memory})
         loss = action + self.subtask_weight * words
@@ -252,14 +253,10 @@ class SubtaskPolicy(MMEPolicy):
             if isinstance(batch, SubtaskBatch) and batch.forced is not None:
                 ids, mask = batch.forced, torch.ones_like(batch.forced, dtype=torch.bool)
             else:
-                ids, mask = self.subtask.generate(*context, self._end)
+                processor = self.require_processor()
+                assert isinstance(processor, SubtaskProcessor)
+                ids, mask = self.subtask.generate(*context, processor.tokenizer.end)
             return MemoryTokens(self.subtask.hidden(*context, ids)[:, 1:], mask)
-
-    @property
-    def _end(self) -> int:
-        processor = self.require_processor()
-        assert isinstance(processor, SubtaskProcessor)
-        return processor.tokenizer.end
 
     @property
     def finetune_spec(self) -> FineTuneSpec:

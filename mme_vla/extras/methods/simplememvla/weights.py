@@ -165,11 +165,12 @@ def read_names(tensors: Mapping[str, Tensor], source: Path) -> dict[str, Tensor]
     """Tensors under the published names: Qwen3.5's get the prefix, and its multi-token prediction
     is left out.
     """
-    named = {
-        name if name.startswith(("backbone.", "action_head.")) else f"backbone.{name}": tensor
-        for name, tensor in tensors.items()
-        if not name.startswith("mtp.")
-    }
+    named = {}
+    for name, tensor in tensors.items():
+        if name.startswith("mtp."):
+            continue
+        prefix = "" if name.startswith(("backbone.", "action_head.")) else "backbone."
+        named[prefix + name] = tensor
     if (
         _LM_HEAD in named
         and _EMBEDDING in named
@@ -290,9 +291,9 @@ def write_simplememvla(
 
     target = simplememvla_of(policy)
     released = simplememvla_adapter(policy).export(policy.state_dict())
-    tensors = {
-        name: cast(released[name].detach(), dtype).cpu().contiguous() for name in sorted(released)
-    }
+    tensors = {}
+    for name in sorted(released):
+        tensors[name] = cast(released[name].detach(), dtype).cpu().contiguous()
     tensors[_LM_HEAD] = tensors[_LM_HEAD].clone()  # tied, and published under both names
     save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
     # Beside what is read here, keys that the authors' code expects

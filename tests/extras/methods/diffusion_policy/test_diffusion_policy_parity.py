@@ -124,7 +124,8 @@ def test_the_condition_and_the_loss_of_every_golden_model(golden: Any) -> None:
             condition = policy.condition(batch, corner=corner)
         close(condition, arrays["out/global_cond_train"])
         draws = {"noise": arrays["in/noise"], "step": torch.tensor(about["timesteps"])}
-        noisy = model.add_noise(policy._schedule(), batch.actions, draws["noise"], draws["step"])
+        schedule = model.noise_schedule(policy.sizes.diffusion_steps)
+        noisy = schedule.add_noise(batch.actions, draws["noise"], draws["step"])
         close(noisy, arrays["out/noisy_action"])
         close(policy.backbone.unet(noisy, draws["step"], condition), arrays["out/predicted_noise"])
         loss, _ = policy(batch, draws, corner)

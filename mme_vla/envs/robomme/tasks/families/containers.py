@@ -158,11 +158,6 @@ class ContainerTask(Task):
         """Colours to be found, in order, each with the container over it."""
         return list(self.contents.items())[: self.pick_count]
 
-    @property
-    def all_containers(self) -> list[Container]:
-        """The inner ones and those around them: lifting a wrong one fails."""
-        return [*self.containers, *self.outer.containers]
-
     def cues(self) -> list[Cue]:
         return [under(container, colour) for colour, container in self.contents.items()]
 
@@ -202,8 +197,11 @@ class ContainerTask(Task):
         )
 
     def _another_lifted(self, container: Container) -> bool:
-        others = (other for other in self.all_containers if other is not container)
-        return any(container_picked_up(other) for other in others)
+        """Whether a wrong one is up, of the inner ones or of those around them."""
+        for other in (*self.containers, *self.outer.containers):
+            if other is not container and container_picked_up(other):
+                return True
+        return False
 
     def choices(self) -> list[Choice]:
         """Pick up a container (which one, a pixel says), or put the held one down."""
