@@ -19,7 +19,7 @@ From image to loss in the order of the calls, with FrameSamp and Modulator:
     Pi05Backbone.predict       backbone/pi05.py: one pass over images, prompt and noisy actions
     JointTransformer.layout    backbone/gemma.py: who attends to whom, and positions (layers.py)
     JointTransformer.forward   backbone/gemma.py: layer after layer
-    JointBlock.forward         backbone/gemma.py: experts project, attend as one, and finish
+    JointBlock.forward         backbone/gemma.py: experts project, attend as one, and run their MLPs
     ModulatorLayer.forward     integration/modulator.py: the hook, before the MLP
     masked_mean                here: the mean over steps and samples
 

@@ -54,7 +54,7 @@ EVALUATION = [
     ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
     ("envs/vector/worker.py", "serve"), ("evaluation/rollout/environment.py", "step"),
     ("envs/make.py", "make_env"), ("envs/interface.py", "step"),
-    ("evaluation/rollout/episode.py", "read"), ("policy/episode.py", "observe"),
+    ("evaluation/rollout/running.py", "read"), ("policy/episode.py", "observe"),
     ("policy/scheduler.py", "next_steps"), ("policy/base.py", "act"),
     ("evaluation/records.py", "to_json"),
 ]  # fmt: skip

@@ -157,7 +157,7 @@ class ExpertLayer(nn.Module):
         k = qk[..., -self.kv_heads :, :]
         return None if self.keys_only else qk[..., : self.heads, :], k, v, gate
 
-    def finish(
+    def feed_forward(
         self,
         x: Tensor,
         attended: Tensor,
@@ -165,7 +165,7 @@ class ExpertLayer(nn.Module):
         condition: Tensor | Modulation | None,
         hook: Callable[[Tensor], Tensor] | None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Add the attention's output; the hook changes only what the MLP reads.
+        """Add the attention's output and run the MLP; the hook changes only what that reads.
 
         Returns:
             The sum [b, n, d], and the MLP's output and gate, which are to be added to it.
@@ -279,14 +279,14 @@ class JointBlock(nn.Module):
             mask = select_rows(mask, [each.rows for each in querying], k.dtype)
         attended = attend(_join(queries), all_k, all_v, mask)
 
-        # Every expert finishes its own. Only the action expert has a hook.
+        # Every expert continues with its own tokens. Only the action expert has a hook.
         lengths = [each.rows.stop - each.rows.start for each in querying]
         updated = []
         for each, piece in zip(querying, attended.split(lengths, dim=1), strict=True):
             if each.expert == self.action_expert:
-                finished = each.layer.finish(each.x, piece, each.gate, mlp_condition, hook)
+                finished = each.layer.feed_forward(each.x, piece, each.gate, mlp_condition, hook)
             else:
-                finished = each.layer.finish(each.x, piece, each.gate, None, None)
+                finished = each.layer.feed_forward(each.x, piece, each.gate, None, None)
             following = Segment(each.expert, *finished)
             if not defers_sum:
                 following = Segment(each.expert, following.summed())

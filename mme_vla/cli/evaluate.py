@@ -52,7 +52,7 @@ SUBGOAL_MODES = ("inline", "background")
 
 
 @dataclass(frozen=True)
-class EvalRun:
+class EvaluateCommand:
     """An evaluation as a command line describes it: the keys of `configs/evaluate.yaml`."""
 
     episodes: Any
@@ -83,18 +83,20 @@ class EvalRun:
 def main(cfg: DictConfig) -> None:
     """Evaluate a policy; of a folder of trainings one after the other."""
     config = policy_config(cfg)
-    run = EvalRun.from_config(config)
+    run = EvaluateCommand.from_config(config)
     trainings = []
     if run.policy.checkpoint is not None:
         trainings = trainings_in(find_run(Path(run.policy.checkpoint).expanduser()))
     check_finished(trainings)
     for training in trainings:
-        evaluate_one(EvalRun.from_config({**config, "checkpoint": str(training)}), training.name)
+        evaluate_one(
+            EvaluateCommand.from_config({**config, "checkpoint": str(training)}), training.name
+        )
     if not trainings:
         evaluate_one(run)
 
 
-def evaluate_one(run: EvalRun, training: str = "") -> None:
+def evaluate_one(run: EvaluateCommand, training: str = "") -> None:
     """Run the episodes of one policy; `training` is the folder of its records in `output`."""
     settings = run.rollout
     if run.output is not None:

@@ -144,14 +144,14 @@ class MemoryModule(nn.Module):
         return None
 
     def condition_on_prompt(
-        self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
+        self, history: HistoryTokens, with_prompt: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
         """A selection as the backbone reads it with a prompt: its vision tokens [b, n, d_vision]
-        through `condition` (`MMEModel.prompt_condition`).
+        through `with_prompt` (`MMEModel.prompt_condition`).
         """
         if self.uses_proprio:  # its features are states and actions
             return history
-        return replace(history, features=condition(history.features))
+        return replace(history, features=with_prompt(history.features))
 
     def gather_selection(
         self, history: History, step: int, rng: np.random.Generator | None = None

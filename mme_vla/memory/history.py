@@ -398,14 +398,14 @@ class OnlineHistory(History):
 
 
 class PromptConditionedHistory(History):
-    """A history whose tokens are changed as they are gathered, by the `condition` of its prompt
+    """A history whose tokens are changed as they are gathered, by `with_prompt`
     (`MMEModel.prompt_condition`, of a batch of one).
     """
 
-    def __init__(self, source: History, condition: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, source: History, with_prompt: Callable[[Tensor], Tensor]) -> None:
         super().__init__(source.spec, source.exec_start)
         self._source = source
-        self._condition = condition
+        self._with_prompt = with_prompt
         self.motion = source.motion
         self.state_width = source.state_width
         self.clock_starts = source.clock_starts
@@ -422,7 +422,7 @@ class PromptConditionedHistory(History):
         return self._source.stored_frames
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._condition(self._source.gather(indices)[None])[0]
+        return self._with_prompt(self._source.gather(indices)[None])[0]
 
     def stored(self, indices: np.ndarray) -> Tensor:
         return self._source.stored(indices)

@@ -118,11 +118,11 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         )
 
     def condition_on_prompt(
-        self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
+        self, history: HistoryTokens, with_prompt: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
         features = []
         for i, selection in self._split(history):
-            features.append(self.memories[i].condition_on_prompt(selection, condition).features)
+            features.append(self.memories[i].condition_on_prompt(selection, with_prompt).features)
         return replace(history, features=torch.cat(features, 1))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:

@@ -416,13 +416,13 @@ def choose_actions(
     policy: Policy,
     episodes: Sequence[Episode],
     steps: int | None = None,
-    predict: Callable[[Any, Mapping[str, Tensor]], Tensor] | None = None,
+    sample_chunk: Callable[[Any, Mapping[str, Tensor]], Tensor] | None = None,
 ) -> SelectedActions:
     """Choose the next chunk for episodes in one batch, with each episode's own noise.
 
     Args:
         steps: of an iterative sampler; its default by default.
-        predict: in place of `Policy.predict_chunk`, from the observation and its noise to the
+        sample_chunk: in place of `Policy.predict_chunk`, from the observation and its noise to the
             normalised chunk [n, h, a].
     """
     policy.require_processor().require_stats()  # before the noise or memory of an episode changes
@@ -431,10 +431,10 @@ def choose_actions(
     was_training = policy.training
     policy.eval()
     try:
-        if predict is None:
+        if sample_chunk is None:
             chunk = policy.predict_chunk(batch, episodes, noise, steps)
         else:
-            chunk = predict(batch, noise)
+            chunk = sample_chunk(batch, noise)
         chunk = chunk.float().cpu()
     finally:
         policy.train(was_training)

@@ -419,8 +419,8 @@ class MMEPolicy(NetworkPolicy):
         Raises:
             UserError: the backbone needs the prompt, as `MMEModel.memory_tokens` gives it.
         """
-        conditions = type(self.backbone).condition_on_prompt is not Backbone.condition_on_prompt
-        if history is not None and conditions:
+        reads_prompt = type(self.backbone).condition_on_prompt is not Backbone.condition_on_prompt
+        if history is not None and reads_prompt:
             raise UserError(
                 f"encode_memory: {type(self.backbone).__name__} reads stored tokens with the"
                 " prompt. Call policy.model.memory_tokens(batch)."
@@ -444,8 +444,8 @@ class MMEPolicy(NetworkPolicy):
         with self.autocast():
             histories = []
             for i, episode in enumerate(episodes):
-                condition = self.model.prompt_condition(batch.rows(slice(i, i + 1)))
-                history = PromptConditionedHistory(episode.required_history(), condition)
+                with_prompt = self.model.prompt_condition(batch.rows(slice(i, i + 1)))
+                history = PromptConditionedHistory(episode.required_history(), with_prompt)
                 episode.read = history
                 histories.append(history)
             return self.memory.encode(histories, [episode.stream for episode in episodes])

@@ -13,7 +13,7 @@ from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import VIDEO
 from helpers.union_frames import JOBS, STEPS, WatchedEnv, both_ways, make_watched_env, outcomes
 from mme_vla import UserError
-from mme_vla.evaluation.rollout.episode import LONGEST_MOTION, RenderPlan
+from mme_vla.evaluation.rollout.running import LONGEST_MOTION, RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor

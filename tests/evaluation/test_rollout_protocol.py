@@ -9,7 +9,7 @@ import torch
 from helpers.rollout_fakes import JOBS, InlineEnvs, quick_policy, roll
 from helpers.scripted_env import VIDEO, make_moving_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollout.episode import episode_seed
+from mme_vla.evaluation.rollout.running import episode_seed
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.subgoal import build_predictor
 from mme_vla.testing.small import cached_history

@@ -20,8 +20,8 @@ from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError, place_of, text_of
 from mme_vla.evaluation.records import EpisodeRecord, OfRun
 from mme_vla.evaluation.rollout.environment import ChunkCommand
-from mme_vla.evaluation.rollout.episode import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims

@@ -14,9 +14,9 @@ from mme_vla.envs.base import CHOICES, environment
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.environment import OPTIONS, Frames, Report
-from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
 from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.play.game import ChoiceSession
 from mme_vla.extras.play.players import NoChoiceError, Player

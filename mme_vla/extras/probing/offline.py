@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.evaluation.rollout.episode import episode_seed
+from mme_vla.evaluation.rollout.running import episode_seed
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm
 from mme_vla.extras.probing.channels import MemorySnapshot

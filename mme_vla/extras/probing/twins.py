@@ -38,9 +38,9 @@ from mme_vla.evaluation.rollout.environment import (
     base_env,
     make_rollout_env,
 )
-from mme_vla.evaluation.rollout.episode import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.evaluation import RunOptions, run_settings
 from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import claim_run
 from mme_vla.extras.probing.arms import UNPROBED, lacking, read_arm

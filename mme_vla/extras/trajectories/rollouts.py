@@ -19,9 +19,9 @@ from mme_vla.config.sections import read_section
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
 from mme_vla.evaluation.rollout.environment import Report, base_env, make_rollout_env
-from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.runner import Ending, Rollout, RunFacts
+from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, sample_path
 from mme_vla.memory.base import stack_history
@@ -319,7 +319,7 @@ class _Collector(Rollout):
         observations: list[Batch] = []
         paths: list[SamplePath] = []
 
-        def predict(observation: Batch, noise: Mapping[str, Tensor]) -> Tensor:
+        def sample_chunk(observation: Batch, noise: Mapping[str, Tensor]) -> Tensor:
             observations.append(_with_memory(policy, observation, batch))
             if "increments" in noise and "log_probs" in self.keep:
                 deviation = policy.backbone.head.deviation  # type: ignore[union-attr]
@@ -327,7 +327,7 @@ class _Collector(Rollout):
                 return paths[0].chunk
             return policy.predict_chunk(observation, episodes, noise, self.settings.flow_steps)
 
-        selection = choose_actions(policy, episodes, predict=predict)
+        selection = choose_actions(policy, episodes, sample_chunk=sample_chunk)
         rows = observations[0]
         path = paths[0] if paths else None
         execute = self.settings.execute or policy.embodiment.action.execute

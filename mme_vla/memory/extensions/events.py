@@ -110,10 +110,10 @@ class Events(PerceptualMemory):
         return np.sort(best[value[best] > 0])
 
     def condition_on_prompt(
-        self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
+        self, history: HistoryTokens, with_prompt: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
         # States choose the frames; the features are vision tokens.
-        return replace(history, features=condition(history.features))
+        return replace(history, features=with_prompt(history.features))
 
 
 def peaks(values: np.ndarray) -> np.ndarray:

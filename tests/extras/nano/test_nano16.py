@@ -20,7 +20,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.environment import Report
-from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.extras.nano import evaluating
 from mme_vla.extras.nano.cli.nano import with_settings
 from mme_vla.extras.nano.demonstrations import Demonstration
