@@ -63,7 +63,8 @@ class MikasaScene(gymnasium.Env[Any, Any]):
                 render_backend=self._backend,
                 sensor_configs=cameras,
             )
-        self.scene: Any = self._env.unwrapped
+        self.scene: Any
+        self.scene = self._env.unwrapped
         if render:
             keep_renderer(self.scene._render_device)
         self._task = task
