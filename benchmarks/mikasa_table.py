@@ -23,7 +23,7 @@ from typing import Any
 from mme_vla.errors import check_known
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.store import read_folders
-from mme_vla.extras.mikasa.catalog import FAMILY_OF
+from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
 from mme_vla.utils import write_atomically
 
 MOST_STEPS = 120
@@ -146,7 +146,6 @@ def _rows_of(
     model, seed, missing = unit
     folder: Path = args.output
     data = folder / "demonstrations"
-    tasks = _key(args.tasks)
     name = f"{model}/{seed}"
     training = folder / "training" / name
     if not (training / "summary.json").is_file():
@@ -156,16 +155,22 @@ def _rows_of(
         run(["train", "env=mikasa", f"data.sources=[{data}]", *words])
 
     # Both continue what an interruption left, and repeat nothing.
-    closed_loop = ["env=mikasa", f"checkpoint={training}", tasks, "execute=8"]
+    closed_loop = ["env=mikasa", f"checkpoint={training}", "execute=8"]
     evaluated = folder / "evaluation" / name
-    run([
-        "evaluate", *closed_loop, f"episodes={args.episodes}", f"max_steps={args.most_steps}",
-        "workers=1", f"output={evaluated}",
-    ])  # fmt: skip
+    episodes = [f"episodes={args.episodes}", "workers=1"]
+    # `max_steps` takes the place of a task's own limit: tasks that keep theirs run separately.
+    shorter = [task for task in args.tasks if STEPS[task] <= args.most_steps]
+    longer = [task for task in args.tasks if STEPS[task] > args.most_steps]
+    if shorter:
+        output = f"output={evaluated / 'own_limit'}"
+        run(["evaluate", *closed_loop, _key(shorter), *episodes, output])
+    if longer:
+        limit = f"max_steps={args.most_steps}"
+        output = f"output={evaluated / 'shortened'}"
+        run(["evaluate", *closed_loop, _key(longer), *episodes, limit, output])
     twins = folder / "twins" / name
-    run([
-        "probe", "twins", *closed_loop, f"episodes={args.pairs}", f"output={twins}",
-    ])  # fmt: skip
+    pairs = f"episodes={args.pairs}"
+    run(["probe", "twins", *closed_loop, _key(args.tasks), pairs, f"output={twins}"])
 
     # A memory that keeps frames keeps the same ones whatever it has learned: once for all seeds.
     writing = folder / "writing" / f"{model}.json"
@@ -178,7 +183,7 @@ def _rows_of(
         ])  # fmt: skip
 
     successes: dict[str, list[bool]] = {}
-    for record in read_folders(sorted(evaluated.glob("episodes*.jsonl"))):
+    for record in read_folders(sorted(evaluated.rglob("episodes*.jsonl"))):
         successes.setdefault(record.task, []).append(record.success)
     accuracies = json.loads((twins / "twins.json").read_text())["tasks"]
     stored: dict[str, Any] = {}
