@@ -59,6 +59,7 @@ TRAINING = (
     "train.save_every=200",
     "train.val_samples=0",
     "train.open_loop_chunks=0",
+    "data.cache.max_build_frames=1000000",
     "train.workers=0",
     "logger=none",
 )
