@@ -11,16 +11,19 @@ The same command continues an interrupted run. Rows are added when a training ha
 import argparse
 import csv
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import check_known
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.store import read_folders
-from mme_vla.extras.mikasa.catalog import FAMILY_OF
+from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
 from mme_vla.utils import write_atomically
 
 MOST_STEPS = 120
@@ -56,6 +59,7 @@ TRAINING = (
     "train.save_every=200",
     "train.val_samples=0",
     "train.open_loop_chunks=0",
+    "data.cache.max_build_frames=1000000",
     "train.workers=0",
     "logger=none",
 )
@@ -67,10 +71,11 @@ Run = Callable[[Sequence[str]], None]
 """Runs a command of the library, given its words."""
 
 
-def run_command(words: Sequence[str]) -> None:
-    """Run a command in a process of its own, as its memory is then free for the next."""
+def run_command(words: Sequence[str], threads: int) -> None:
+    """Run a command in a process of its own with this many threads."""
     print("mme-vla", *words, flush=True)
-    subprocess.run([sys.executable, "-m", "mme_vla", *words], check=True)
+    variables = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    subprocess.run([sys.executable, "-m", "mme_vla", *words], check=True, env=variables)
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
@@ -89,8 +94,9 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def measure(args: argparse.Namespace, run: Run = run_command) -> list[dict[str, str]]:
-    """Carry out what the output lacks: demonstrations, then a training and its measures each.
+def measure(args: argparse.Namespace, run: Run | None = None) -> list[dict[str, str]]:
+    """Carry out what the output lacks: demonstrations, then each training and what is measured of
+    it, `jobs` of them at a time.
 
     Returns:
         The rows of the table.
@@ -99,39 +105,48 @@ def measure(args: argparse.Namespace, run: Run = run_command) -> list[dict[str, 
         check_known("task in --tasks:", task, FAMILY_OF)
     for model in args.models:
         check_known("model in --models:", model, MODELS)
+    if run is None:
+        run = partial(run_command, threads=max(1, (os.cpu_count() or 1) // args.jobs))
     folder: Path = args.output
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = f"tasks=[{','.join(args.tasks)}]"
     data = folder / "demonstrations"
     if not (data / "meta" / "info.json").is_file():
         count = f"episodes={args.demonstrations}"
-        run(["record", "env=mikasa", tasks, count, f"output={data}"])
+        workers = f"workers={args.jobs}"
+        run(["record", "env=mikasa", _key(args.tasks), count, workers, f"output={data}"])
 
     table = folder / "table.csv"
+    known = {(row["model"], row["seed"], row["task"]) for row in read_table(table)}
+    units: list[tuple[str, int, Sequence[str]]] = []
     for seed in range(args.seeds):
         for model in args.models:
-            rows = read_table(table)
-            known = {(row["model"], row["seed"], row["task"]) for row in rows}
             missing = [task for task in args.tasks if (model, str(seed), task) not in known]
             if missing:
-                new = _rows_of(model, seed, missing, tasks, data, args, run)
-                write_table(table, [*rows, *new])
+                units.append((model, seed, missing))
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for new in pool.map(partial(_rows_of, args=args, run=run), units):
+            write_table(table, [*read_table(table), *new])
     return read_table(table)
 
 
+def _key(tasks: Sequence[str]) -> str:
+    return f"tasks=[{','.join(tasks)}]"
+
+
 def _rows_of(
-    model: str,
-    seed: int,
-    missing: Sequence[str],
-    tasks: str,
-    data: Path,
-    args: argparse.Namespace,
-    run: Run,
+    unit: tuple[str, int, Sequence[str]], args: argparse.Namespace, run: Run
 ) -> list[dict[str, Any]]:
-    """Train a policy, as far as it is not, and measure it: a row for each task that the table
-    lacks.
+    """Train a policy, as far as it is not, and measure it.
+
+    Args:
+        unit: model, seed, and the tasks whose rows the table lacks.
+
+    Returns:
+        A row for each of these tasks.
     """
+    model, seed, missing = unit
     folder: Path = args.output
+    data = folder / "demonstrations"
     name = f"{model}/{seed}"
     training = folder / "training" / name
     if not (training / "summary.json").is_file():
@@ -141,20 +156,27 @@ def _rows_of(
         run(["train", "env=mikasa", f"data.sources=[{data}]", *words])
 
     # Both continue what an interruption left, and repeat nothing.
-    closed_loop = ["env=mikasa", f"checkpoint={training}", tasks, "execute=8"]
+    closed_loop = ["env=mikasa", f"checkpoint={training}", "execute=8"]
     evaluated = folder / "evaluation" / name
-    run([
-        "evaluate", *closed_loop, f"episodes={args.episodes}", f"max_steps={args.most_steps}",
-        f"workers={args.workers}", f"output={evaluated}",
-    ])  # fmt: skip
+    episodes = [f"episodes={args.episodes}", "workers=1"]
+    # `max_steps` takes the place of a task's own limit: tasks that keep theirs run separately.
+    shorter = [task for task in args.tasks if STEPS[task] <= args.most_steps]
+    longer = [task for task in args.tasks if STEPS[task] > args.most_steps]
+    if shorter:
+        output = f"output={evaluated / 'own_limit'}"
+        run(["evaluate", *closed_loop, _key(shorter), *episodes, output])
+    if longer:
+        limit = f"max_steps={args.most_steps}"
+        output = f"output={evaluated / 'shortened'}"
+        run(["evaluate", *closed_loop, _key(longer), *episodes, limit, output])
     twins = folder / "twins" / name
-    run([
-        "probe", "twins", *closed_loop, f"episodes={args.pairs}", f"output={twins}",
-    ])  # fmt: skip
+    pairs = f"episodes={args.pairs}"
+    run(["probe", "twins", *closed_loop, _key(args.tasks), pairs, f"output={twins}"])
 
-    # A memory that keeps frames keeps the same ones whatever it has learned.
+    # A memory that keeps frames keeps the same ones whatever it has learned: once for all seeds.
     writing = folder / "writing" / f"{model}.json"
-    if model in SELECTING and not writing.is_file():
+    is_measured = model in SELECTING and seed == 0
+    if is_measured and not writing.is_file():
         run([
             "analyse", "writing", "--env", "mikasa", "--checkpoint", str(training), "--memories",
             "--tasks", ",".join(args.tasks), "--episodes", str(args.episodes),
@@ -162,11 +184,11 @@ def _rows_of(
         ])  # fmt: skip
 
     successes: dict[str, list[bool]] = {}
-    for record in read_folders(sorted(evaluated.glob("episodes*.jsonl"))):
+    for record in read_folders(sorted(evaluated.rglob("episodes*.jsonl"))):
         successes.setdefault(record.task, []).append(record.success)
     accuracies = json.loads((twins / "twins.json").read_text())["tasks"]
     stored: dict[str, Any] = {}
-    if writing.is_file():
+    if is_measured:
         stored = next(iter(json.loads(writing.read_text()).values()))["tasks"]
     rows = []
     for task in missing:
@@ -222,7 +244,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=10, help="test scenes of each task")
     parser.add_argument("--pairs", type=int, default=3, help="pairs of twins of each task")
     parser.add_argument("--most-steps", type=int, default=MOST_STEPS, help="of an episode")
-    parser.add_argument("--workers", type=int, default=2, help="processes that simulate")
+    parser.add_argument("--jobs", type=int, default=2, help="trainings or measurements at a time")
     print(summary(measure(parser.parse_args(words))))
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE
+from mme_vla.envs.rendering import links_culled
 from mme_vla.errors import check_known, require
 
 if TYPE_CHECKING:
@@ -218,7 +219,7 @@ def capture(task: "Task", cameras: Collection[str]) -> None:
         task.scene.update_render(update_sensors=True, update_human_render_cameras=False)
     for name in cameras:
         sensor = task.scene.sensors[SENSORS[name]]
-        with task.rendering(sensor.camera):
+        with links_culled(task, sensor.camera):
             sensor.capture()
 
 

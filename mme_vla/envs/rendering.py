@@ -9,7 +9,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -23,7 +23,9 @@ from mme_vla.utils import user_cache, write_atomically
 
 if TYPE_CHECKING:
     import sapien
+    from mani_skill.envs.sapien_env import BaseEnv
     from mani_skill.render import ShaderConfig
+    from mani_skill.utils.structs.render_camera import RenderCamera
 
 INSTALL_HINT = (
     "Rendering needs a Vulkan driver: an NVIDIA GPU's own, or, without one, Mesa's software driver,"
@@ -201,6 +203,20 @@ def _pipeline_folder() -> Path | None:
 
 MARGIN = 1e-3
 """Metres that a box must lie beyond the edge of an image."""
+
+
+def links_culled(env: "BaseEnv", camera: "RenderCamera") -> AbstractContextManager[None]:
+    """While a camera renders on the CPU, hide the links of the robot that it cannot see."""
+    from sapien.render import RenderBodyComponent
+
+    if not env._render_device.is_cpu():
+        return nullcontext()
+    bodies = []
+    for link in env.agent.robot.links:
+        body = link._objs[0].entity.find_component_by_type(RenderBodyComponent)
+        if body is not None:
+            bodies.append(body)
+    return culled(bodies, camera._render_cameras[0])
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from sapien.render import RenderBodyComponent
 from helpers.env_scenes import Scene
 from mme_vla.envs import make_env, rendering
 from mme_vla.envs.observations import SENSORS, RenderRequest, capture, read_images
-from mme_vla.envs.rendering import PACK, renderer_works, without_table
+from mme_vla.envs.rendering import PACK, links_culled, renderer_works, without_table
 from mme_vla.envs.robomme.robot import robots
 from mme_vla.envs.robomme.robot.robots import CELL, coarsen, read_stl, stl_bytes
 from mme_vla.envs.robomme.scene import stage
@@ -217,7 +217,7 @@ def test_hiding_links_out_of_sight_and_reading_without_a_copy_change_no_pixel(
             capture(scene, [name])
             actual = read_images(scene, name, rgb=True, depth=True, segmentation=True)
             sensor = scene.scene.sensors[sensor_name]
-            with scene.rendering(sensor.camera):
+            with links_culled(scene, sensor.camera):
                 bodies = [
                     entity.find_component_by_type(RenderBodyComponent) for entity in links(scene)
                 ]

@@ -58,7 +58,7 @@ def test_the_cue_can_be_a_conditioning_video() -> None:
 
 
 @pytest.mark.usefixtures("renderer")
-def test_images_on_demand_are_those_of_the_simulators_own_observations() -> None:
+def test_images_on_demand_are_the_simulators_own_but_for_the_wrist_cameras_body() -> None:
     import gymnasium
 
     env = opened("RememberColor3", render=True)
@@ -75,7 +75,9 @@ def test_images_on_demand_are_those_of_the_simulators_own_observations() -> None
     for _ in range(3):
         for name, camera in (("top", "base_camera"), ("wrist", "hand_camera")):
             image = observation["sensor_data"][camera]["rgb"][0].numpy()
-            np.testing.assert_array_equal(frames[f"{name}_rgb_list"][-1], image)
+            differs = (frames[f"{name}_rgb_list"][-1] != image).any(-1)
+            most = {"top": 0.01, "wrist": 0}[name]  # the wrist camera does not see itself
+            assert differs.mean() <= most, f"{differs.sum()} pixels of {name} differ"
         frames, *_ = env.step(action)
         observation, *_ = reference.step(action)
     reference.close()

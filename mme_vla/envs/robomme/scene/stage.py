@@ -1,7 +1,7 @@
 """The stage of a task: robot, table, cameras and the step counter."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,11 +11,9 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
-from mani_skill.utils.structs.render_camera import RenderCamera
-from sapien.render import RenderBodyComponent
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.envs.rendering import culled, keep_renderer, lean_shaders
+from mme_vla.envs.rendering import keep_renderer, lean_shaders
 from mme_vla.envs.robomme.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.robomme.scene.things import Thing, pose_of
 
@@ -104,17 +102,6 @@ class Stage(BaseEnv):
                 self._custom_sensor_configs = {"shader_config": lean}
         super()._setup_sensors(options)
         self._custom_sensor_configs = configs
-
-    def rendering(self, camera: RenderCamera) -> AbstractContextManager[None]:
-        """While a camera renders on the CPU, links that it cannot see are hidden."""
-        if not self._render_device.is_cpu():
-            return nullcontext()
-        bodies = []
-        for link in self.agent.robot.links:
-            body = link._objs[0].entity.find_component_by_type(RenderBodyComponent)
-            if body is not None:
-                bodies.append(body)
-        return culled(bodies, camera._render_cameras[0])
 
     def _load_scene(self, options: dict) -> None:
         """Put up the table, with nothing on it."""
