@@ -18,6 +18,7 @@ from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
+from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.compare import (
     Comparison,
     common_episodes,
@@ -147,6 +148,7 @@ def run(args: argparse.Namespace) -> None:
             [stress_table(curves)],
             stress_figures(curves),
             "Episodes that every place of the dial has.",
+            records,
             args,
         )
         return
@@ -249,7 +251,7 @@ def show_events(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> N
         stress_table(curves, "Success over the length of events"),
     ]
     figures = stress_figures(curves, "control steps, frames or factor")
-    show_tables(tables, figures, "Episodes that every length has.", args)
+    show_tables(tables, figures, "Episodes that every length has.", records, args)
 
 
 def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
@@ -273,11 +275,15 @@ def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None
         "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an"
         " amount.",
     )
-    show_tables(filled, ood.extrapolation_figures(curves), caption, args)
+    show_tables(filled, ood.extrapolation_figures(curves), caption, records, args)
 
 
 def show_tables(
-    tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace
+    tables: Sequence[Table],
+    figures: dict[str, str],
+    caption: str,
+    records: Sequence[EpisodeRecord],
+    args: argparse.Namespace,
 ) -> None:
     """Print tables that have rows, and all notes, and write them, with figures, where a file is
     named.
@@ -296,6 +302,7 @@ def show_tables(
             print_table(table, Console().width)
             blocks.append(to_markdown(table))
             sections.append(Section(table.title, tables=[table]))
+    notes += missing_baselines(record.model for record in records)
     for note in notes:
         print(f"• {printable(note)}")
     if args.markdown:

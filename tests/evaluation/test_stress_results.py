@@ -47,3 +47,13 @@ def test_the_command_saves_the_curve(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "<svg" in text and "PickXtimes, count" in text and "<h1>a &lt; b</h1>" in text
     with pytest.raises(UserError, match="None of these records is of a stress split"):
         stress_curves(records("test", [1]))
+
+
+def test_the_command_names_the_baselines_that_are_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for model in ("framesamp_modul", "ttt_modul"):
+        save_records(tmp_path / model, records("stress:count=3", [0, 0], model))
+    main([str(tmp_path), "--stress", "--markdown", str(tmp_path / "page.md")])
+    for text in (capsys.readouterr().out, (tmp_path / "page.md").read_text()):
+        assert "train present_modul to compare" in " ".join(text.split()).replace("\\", "")
