@@ -20,10 +20,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
+
 from mme_vla.errors import check_known
 from mme_vla.evaluation.results.baselines import missing_baselines
+from mme_vla.evaluation.results.scopes import PAPER_ORDER
+from mme_vla.evaluation.results.statistics import percentiles
 from mme_vla.evaluation.store import read_folders
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
+from mme_vla.extras.nano.board import Board, published_success, spearman
+from mme_vla.extras.nano.cli.board import published_rows
+from mme_vla.extras.nano.rows import CHOICES, read_rows, table_of
 from mme_vla.utils import write_atomically
 
 MOST_STEPS = 120
@@ -227,7 +235,43 @@ def summary(rows: Sequence[Mapping[str, str]]) -> str:
             values = [float(row[column]) for row in of_model if row[column]]
             cells.append(f"{sum(values) / len(values):.3f}" if values else "")
         lines.append(f"| {model} | {len(of_model)} | {' | '.join(cells)} |")
-    return "\n".join([*lines, *missing_baselines(models)])
+    return "\n".join([*lines, "", *agreements(rows), *missing_baselines(models)])
+
+
+def agreements(rows: Sequence[Mapping[str, str]], samples: int = 2000) -> list[str]:
+    """Sentences with the rank correlation of success and of twin accuracy with nanoMME-16 and with
+    the paper, over the models that both have; tasks are resampled for the intervals.
+    """
+    shipped = published_rows(table_of("further", CHOICES))
+    assert shipped is not None
+    board = Board(read_rows([shipped]), samples=1)
+    references: dict[str, dict[str, float]] = {"nanoMME-16": {}, "the paper": {}}
+    for row in board.rows:
+        references["nanoMME-16"][row.name] = board.success(row)
+        if row.paper is not None:
+            references["the paper"][row.name] = published_success(row.paper, PAPER_ORDER)
+
+    table = pd.DataFrame(rows)
+    for column in ("successes", "episodes", "twin_accuracy"):
+        table[column] = pd.to_numeric(table[column])
+    table["success"] = table["successes"] / table["episodes"]
+    sentences = []
+    for measure_name, column in (("success", "success"), ("twin accuracy", "twin_accuracy")):
+        by_task = table.pivot_table(column, "task", "model").dropna()  # means over trainings
+        for name, known in references.items():
+            common = [model for model in by_task.columns if model in known]
+            if len(common) < 3 or by_task.empty:
+                continue
+            values = by_task[common].to_numpy()
+            published = np.array([known[model] for model in common])
+            drawn = np.random.default_rng(0).integers(len(values), size=(samples, len(values)))
+            low, high = percentiles(spearman(values[drawn].mean(axis=1), published))
+            sentences.append(
+                f"Rank correlation of {measure_name} with {name}, {len(common)} models and"
+                f" {len(values)} tasks: {spearman(values.mean(axis=0), published):.2f}"
+                f" [{low:.2f}, {high:.2f}]."
+            )
+    return sentences
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 from benchmarks import mikasa_table
-from benchmarks.mikasa_table import MODELS, MOST_STEPS, SELECTING, TASKS, measure, summary
+from benchmarks.mikasa_table import (
+    MODELS,
+    MOST_STEPS,
+    SELECTING,
+    TASKS,
+    agreements,
+    measure,
+    summary,
+)
 from helpers.rollout_fakes import save_records
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
@@ -93,6 +101,21 @@ def test_every_row_is_made_once(tmp_path: Path) -> None:
     text = summary(rows)
     assert "| framesamp_modul | 4 | 0.500 | 0.500 | 0.625 | 0.500 |" in text
     assert "train present_modul to compare" in text
+
+
+def test_the_ranking_is_compared_with_nanomme_and_the_paper() -> None:
+    order = ["pi05", "present_modul", "ttt_modul", "framesamp_modul", "tokendrop_modul"]
+    rows = []
+    for i, model in enumerate(order):
+        for task in CHOSEN:
+            accuracy = str(1 - 0.2 * i) if task == "RememberColor3" else ""
+            row = {"model": model, "task": task, "successes": str(i), "episodes": "10"}
+            rows.append({**row, "twin_accuracy": accuracy})
+    success, of_paper, twins, *_ = agreements(rows)
+    assert "success with nanoMME-16, 5 models and 2 tasks: 1.00 [1.00, 1.00]" in success
+    assert "success with the paper, 4 models" in of_paper
+    assert "twin accuracy with nanoMME-16, 5 models and 1 tasks: -1.00" in twins
+    assert agreements([row for row in rows if row["model"] in order[:2]]) == []
 
 
 @pytest.mark.parametrize("stop", [1, 2, 3, 5, 7])
