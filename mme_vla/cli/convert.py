@@ -17,8 +17,8 @@ def main(cfg: DictConfig) -> None:
     inputs = [cfg.input] if isinstance(cfg.input, str) else list(cfg.input)
     episodes = list_episodes(find_files(inputs))
     if cfg.episodes is not None:
-        chosen = set(cfg.episodes)
-        episodes = [ref for ref in episodes if ref.index in chosen]
+        indices = set(cfg.episodes)
+        episodes = [ref for ref in episodes if ref.index in indices]
     output = Path(cfg.output)
     options = {"images": cfg.images, "fps": cfg.fps, "keyframes": cfg.keyframes, "names": cfg.names}
     n_converted = convert(

@@ -35,8 +35,8 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
     there of other files stay.
     """
     if names is None:
-        found = filter(Path.is_file, folder.rglob("*"))
-        names = [path.relative_to(folder).as_posix() for path in found]
+        paths = filter(Path.is_file, folder.rglob("*"))
+        names = [path.relative_to(folder).as_posix() for path in paths]
     files = sorted(set(names) - {SUMS})
     table: dict[str, str] = {}
     if keep and (folder / SUMS).exists():

@@ -211,8 +211,8 @@ class KeyframeEpisode(Episode):
     def _store_video(self) -> None:
         most = self._policy.require_processor().video_frames
         count = min(len(self._video), most)
-        spread = np.linspace(0, len(self._video) - 1, count).round().astype(int)
-        for place, index in enumerate(spread):
+        indices = np.linspace(0, len(self._video) - 1, count).round().astype(int)
+        for place, index in enumerate(indices):
             shots, finger = self._video[index]
             scene = self._scene_inputs(shots, finger, place)
             self.remembered = self._policy.watch(scene, self.remembered)

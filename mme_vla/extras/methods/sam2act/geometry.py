@@ -148,8 +148,8 @@ def angles_of(quaternions: Tensor) -> Tensor:
     roll = torch.where(up, 2 * difference, torch.where(down, 2 * added, difference + added))
     yaw = torch.where(up | down, 0.0, added - difference)
     tilt = torch.where(up, 90.0, torch.where(down, -90.0, tilt))
-    turns = torch.rad2deg(torch.stack([roll, yaw]))
-    roll, yaw = 180 - (180 - turns).remainder(360)  # into (−180, 180]
+    degrees = torch.rad2deg(torch.stack([roll, yaw]))
+    roll, yaw = 180 - (180 - degrees).remainder(360)  # into (−180, 180]
     return torch.stack([roll, tilt, yaw], -1)
 
 

@@ -122,10 +122,10 @@ def first_loss(
     fine, tokens = network.fine_step(network.encode_views(near, scenes.state, scenes.language))
     here = torch.zeros_like(centre)  # the waypoint, in the closer look's cube
     maps = torch.cat([heatmap_loss(coarse, centre), heatmap_loss(fine, here)], 1)
-    given = scenes.bins
+    bins = scenes.bins
     if offsets is not None:
-        given = (given + offsets) % network.sizes.rotation_bins
-    outputs = network.heads(tokens, here, given)
+        bins = (bins + offsets) % network.sizes.rotation_bins
+    outputs = network.heads(tokens, here, bins)
     entropy = nn.functional.cross_entropy
     return {
         "heatmap": maps.mean(),

@@ -141,10 +141,10 @@ def _render_images(points: Tensor, colours: Tensor, inside: Tensor, side: int) -
     nothing = torch.cat([blank, constant_channels(side, points.device)], 1)
     images = []
     for cloud, paint, mask in zip(points, colours, inside, strict=True):
-        seen = nothing
+        views = nothing
         if mask.any():
-            seen = virtual_images(cloud[mask], paint[mask], side)
-        images.append(seen)
+            views = virtual_images(cloud[mask], paint[mask], side)
+        images.append(views)
     return torch.stack(images)
 
 

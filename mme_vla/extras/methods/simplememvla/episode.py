@@ -115,14 +115,14 @@ class VideoEpisode(Episode):
 
     def images_of(self, pairs: Sequence[Pair]) -> Tensor:
         """Temporal patches [n, 2, 3, h, w] uint8 of frames that were observed."""
-        shown = list(chain.from_iterable(pairs))
-        missing = sorted(set(shown) - set(self.video.frames))
+        numbers = list(chain.from_iterable(pairs))
+        missing = sorted(set(numbers) - set(self.video.frames))
         if missing:
             raise UserError(
                 f"The video shows the frames {missing[:5]}, which were not rendered or not"
                 " observed: observe() those that frames_read() names."
             )
-        frames = torch.stack([self.video.frames[frame] for frame in shown])
+        frames = torch.stack([self.video.frames[frame] for frame in numbers])
         return self._policy.require_processor().video(frames)
 
     def encode(self, model: VideoLanguageModel, pairs: Sequence[Pair]) -> Tensor:

@@ -233,8 +233,8 @@ class VideoLanguageModel(nn.Module):
             else:
                 likeliest = []
                 for word_ids in words:
-                    given = [*word_ids, ends.end]
-                    likeliest.append(given[min(len(hidden), len(word_ids))])
+                    targets = [*word_ids, ends.end]
+                    likeliest.append(targets[min(len(hidden), len(word_ids))])
             inputs = []
             for response, tail, word in zip(responses, tails, likeliest, strict=True):
                 if tail or word == ends.end or len(response) == limit:
