@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mme_vla.errors import check_known
+from mme_vla.errors import check_known, counted
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
 from mme_vla.evaluation.results.statistics import percentiles
@@ -120,8 +120,7 @@ def measure(args: argparse.Namespace, run: Run | None = None) -> list[dict[str, 
     data = folder / "demonstrations"
     if not (data / "meta" / "info.json").is_file():
         count = f"episodes={args.demonstrations}"
-        workers = f"workers={args.jobs}"
-        run(["record", "env=mikasa", _key(args.tasks), count, workers, f"output={data}"])
+        run(["record", "env=mikasa", _key(args.tasks), count, f"output={data}"])
 
     table = folder / "table.csv"
     known = {(row["model"], row["seed"], row["task"]) for row in read_table(table)}
@@ -264,12 +263,13 @@ def agreements(rows: Sequence[Mapping[str, str]], samples: int = 2000) -> list[s
                 continue
             values = by_task[common].to_numpy()
             published = np.array([known[model] for model in common])
-            drawn = np.random.default_rng(0).integers(len(values), size=(samples, len(values)))
-            low, high = percentiles(spearman(values[drawn].mean(axis=1), published))
+            draws = np.random.default_rng(0).integers(len(values), size=(samples, len(values)))
+            low, high = percentiles(spearman(values[draws].mean(axis=1), published))
+            models, tasks = counted(len(common), "model"), counted(len(values), "task")
+            correlation = spearman(values.mean(axis=0), published)
             sentences.append(
-                f"Rank correlation of {measure_name} with {name}, {len(common)} models and"
-                f" {len(values)} tasks: {spearman(values.mean(axis=0), published):.2f}"
-                f" [{low:.2f}, {high:.2f}]."
+                f"Rank correlation of {measure_name} with {name}, {models} and {tasks}:"
+                f" {correlation:.2f} [{low:.2f}, {high:.2f}]."
             )
     return sentences
 

@@ -114,7 +114,7 @@ def test_the_ranking_is_compared_with_nanomme_and_the_paper() -> None:
     success, of_paper, twins, *_ = agreements(rows)
     assert "success with nanoMME-16, 5 models and 2 tasks: 1.00 [1.00, 1.00]" in success
     assert "success with the paper, 4 models" in of_paper
-    assert "twin accuracy with nanoMME-16, 5 models and 1 tasks: -1.00" in twins
+    assert "twin accuracy with nanoMME-16, 5 models and 1 task: -1.00" in twins
     assert agreements([row for row in rows if row["model"] in order[:2]]) == []
 
 
