@@ -52,7 +52,7 @@ EVALUATION = [
     ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
     ("evaluation/rollout/evaluation.py", "run"), ("evaluation/store.py", "claim_run"),
     ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
-    ("envs/vector/worker.py", "serve"), ("evaluation/rollout/environment.py", "step"),
+    ("envs/vector/pool.py", "serve"), ("evaluation/rollout/environment.py", "step"),
     ("envs/make.py", "make_env"), ("envs/interface.py", "step"),
     ("evaluation/rollout/running.py", "read"), ("policy/episode.py", "observe"),
     ("policy/scheduler.py", "next_steps"), ("policy/base.py", "act"),

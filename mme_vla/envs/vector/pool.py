@@ -9,11 +9,13 @@
                 # or, when reply.done: envs.start_next(reply.worker)
                 envs.send(reply.worker, action)
 
-Processes inherit nothing of the script that makes one (`worker.py`), which therefore keeps its work
-under `if __name__ == "__main__":`.
+The process of each worker runs `serve`. It inherits nothing of the script that makes one
+(`worker.py`), which therefore keeps its work under `if __name__ == "__main__":`.
 """
 
 import math
+import os
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -32,7 +34,7 @@ from mme_vla.envs.rows import SceneOptions
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import listed, require, text_of
-from mme_vla.utils.processes import signals_deferred
+from mme_vla.utils.processes import end_with_parent, signals_deferred
 
 
 @dataclass(frozen=True)
@@ -272,7 +274,7 @@ class VecEnv:
     def _spawn(self) -> _Worker:
         connection, remote = self._context.Pipe()
         block = self._context.RawArray("B", protocol.BLOCK_BYTES)
-        work = (_work, imported_plugins(), remote, block, self._factory)
+        work = (serve, imported_plugins(), remote, block, self._factory)
         process = self._context.Process(target=begin, args=(settings(), *work), daemon=True)
         with signals_deferred():
             process.start()
@@ -341,9 +343,42 @@ class VecEnv:
         require(not self._closed, "The environments are closed; make new ones.")
 
 
-def _work(plugins: Sequence[str], *arguments: Any) -> None:
+def serve(plugins: Sequence[str], connection: Any, block: Any, factory: Callable[..., Any]) -> None:
+    """The work of a worker process: run commands until `CLOSE`, until the connection ends, or until
+    the renderer has failed.
+    """
     import_plugins(plugins)
-    protocol.serve(*arguments)
+    end_with_parent()
+    os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+    env: Any = None
+    try:
+        while True:
+            command, *arguments = protocol.receive(connection)
+            if command == protocol.CLOSE:
+                return
+            try:
+                if command == protocol.RESET:
+                    if env is not None:
+                        env.close()
+                        env = None
+                    env = factory(**arguments[0])
+                    outcome: Any = env.reset(**arguments[1])
+                elif command == protocol.STEP:
+                    outcome = env.step(arguments[0])
+                else:
+                    continue
+            except Exception as error:
+                if protocol.send_error(connection, error):
+                    continue
+                return
+            protocol.hand_over(connection, block, outcome)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+    finally:
+        if env is not None:
+            env.close()
 
 
 def make_vec_env(

@@ -1,14 +1,13 @@
-"""Processes that simulate: how they start, and the worker of a `VecEnv`.
+"""Processes that simulate: how they start and end, and how messages and frames travel.
 
-They start quickly and inherit only the settings of the process that starts them. A worker builds
-environments, steps them, and sends frames through shared memory.
+They start quickly and inherit only the settings of the process that starts them. What a worker of a
+`VecEnv` does is `serve` in `pool.py`.
 """
 
 import gc
 import multiprocessing
 import os
 import pickle
-import sys
 import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -22,7 +21,6 @@ import numpy as np
 from mme_vla import errors
 from mme_vla.config.plugins import imported_plugins
 from mme_vla.envs.rendering import renderer_works
-from mme_vla.utils.processes import end_with_parent
 
 PRELOADED = ["mme_vla.envs.task"]
 """Modules that simulating processes import before they begin; fixed when the first of them is
@@ -118,41 +116,11 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
     return value
 
 
-def serve(connection: Any, block: Any, factory: Callable[..., Any]) -> None:
-    """Run commands until `CLOSE`, until the connection ends, or until the renderer has failed."""
-    end_with_parent()
-    os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
-    env: Any = None
-    try:
-        while True:
-            command, *arguments = receive(connection)
-            if command == CLOSE:
-                return
-            try:
-                if command == RESET:
-                    if env is not None:
-                        env.close()
-                        env = None
-                    env = factory(**arguments[0])
-                    outcome: Any = env.reset(**arguments[1])
-                elif command == STEP:
-                    outcome = env.step(arguments[0])
-                else:
-                    continue
-            except Exception as error:
-                works = renderer_works()
-                send(connection, FAILURE if works else LOST, _portable(error))
-                if works:
-                    continue
-                return
-            _hand_over(connection, block, outcome)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return
-    finally:
-        if env is not None:
-            env.close()
+def send_error(connection: Any, error: Exception) -> bool:
+    """Send what a command raised; return whether the process is of further use."""
+    is_usable: bool = renderer_works()
+    send(connection, FAILURE if is_usable else LOST, _portable(error))
+    return is_usable
 
 
 def _portable(error: Exception) -> Exception:
@@ -184,7 +152,10 @@ def _is_of_plugin(frame: FrameType) -> bool:
     return not any(Path(file).is_relative_to(folder) for folder in _INSTALLED)
 
 
-def _hand_over(connection: Any, block: Any, outcome: Any) -> None:
+def hand_over(connection: Any, block: Any, outcome: Any) -> None:
+    """Send the outcome of a command: its large arrays piece by piece through the block, then the
+    rest.
+    """
     large: list[np.ndarray] = []
     light = _lift(outcome, large)
     for slots in _pieces(block, large):
