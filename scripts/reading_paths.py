@@ -50,16 +50,17 @@ TRAINING = [
 """
 EVALUATION = [
     ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
-    ("evaluation/rollout/evaluation.py", "run"), ("evaluation/store.py", "claim_run"),
+    ("evaluation/rollout/evaluation.py", "run"),
     ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
     ("envs/vector/pool.py", "serve"), ("evaluation/rollout/environment.py", "step"),
     ("envs/make.py", "make_env"), ("envs/interface.py", "step"),
     ("evaluation/rollout/running.py", "read"), ("policy/episode.py", "observe"),
     ("policy/scheduler.py", "next_steps"), ("policy/base.py", "act"),
-    ("evaluation/records.py", "to_json"),
+    ("evaluation/records.py", "to_json"), ("evaluation/records.py", "append"),
 ]  # fmt: skip
 """From the command line to the line of an episode's record; (d) continues from `act`. Beside it:
-what a terminal shows (`rollout/progress.py`), the run's receipt (`receipts.py`), and, where they
+what a terminal shows (`rollout/progress.py`), the run's folder (`store.py`: `claim_run`
+and, where several processes share a run, `Claims`), its receipt (`receipts.py`), and, where they
 are asked for, events (`rollout/events.py`), subgoals (`rollout/subgoals.py`) and videos
 (`rollout/video.py`).
 """

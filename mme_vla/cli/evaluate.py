@@ -23,7 +23,7 @@ from mme_vla.config.sections import PathText, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
 from mme_vla.errors import check_choice
-from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
+from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, count_outcomes
 from mme_vla.evaluation.results.events import event_table, idle_events
 from mme_vla.evaluation.results.report import policy_facts
 from mme_vla.evaluation.results.tables import print_table
@@ -202,7 +202,7 @@ def choose_subgoals(
 def report(done: Evaluation) -> None:
     """Say how it went, task by task, and where the table comes from."""
     is_scored = total_score(done.records) is not None
-    columns = ["task", "episodes", "success", "fail", "timeout", "error", "success rate"]
+    columns = ["task", "episodes", *OUTCOMES, "success rate"]
     if is_scored:
         columns += ["right subgoals", "points off by"]
     table = Table(*columns)
@@ -215,8 +215,7 @@ def report(done: Evaluation) -> None:
     for task, records in rows:
         counts = count_outcomes(records)
         cells = [task, str(len(records))]
-        for name in ("success", "fail", "timeout", "error"):
-            cells.append(str(counts[name]))
+        cells += [str(counts[outcome]) for outcome in OUTCOMES]
         cells.append(f"{100 * counts['success'] / len(records):.1f} %")
         if is_scored:
             score = total_score(records)

@@ -19,9 +19,9 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, brief
-from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
+from mme_vla.evaluation.records import EpisodeRecord, count_outcomes, read_records
 from mme_vla.evaluation.rollout.events import read_events
-from mme_vla.evaluation.store import RUN_FILE, read_records, read_run
+from mme_vla.evaluation.store import RUN_FILE, read_run
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE
 from mme_vla.policy.training_identity import identity_of

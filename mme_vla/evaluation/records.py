@@ -1,9 +1,16 @@
-"""What is kept of an evaluated episode, and how records come together into runs."""
+"""What is kept of an evaluated episode, the file that holds it, and how records come together into
+runs.
+"""
 
+import fcntl
+import os
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
-from typing import Annotated, Any, NamedTuple, Self, TypedDict
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Annotated, Any, NamedTuple, Self, TypedDict
 
 from mme_vla.config.sections import Range, read_section
 from mme_vla.envs.make import ROBOMME
@@ -12,7 +19,7 @@ from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.run_folders import shipped_checkpoints
 from mme_vla.policy.training_identity import TrainingIdentity
-from mme_vla.utils import parse_json, to_line, verified
+from mme_vla.utils import name_place, parse_json, read_lines, to_line, verified
 
 Integer = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
 Number = Annotated[float, Range(-(2.0**63), 2.0**63)]
@@ -262,6 +269,81 @@ class EpisodeRecord(OfRun):
 
 _OF_ROLLOUTS = {spec.name: spec.default for spec in fields(EpisodeRecord) if spec.kw_only}
 """Field that is not written at its default → that."""
+
+
+class RecordLog:
+    """Appends records to a file of this process, each on disk when `append` returns."""
+
+    def __init__(self, path: Path) -> None:
+        """Open or create `path`, and remove a half-written last line."""
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file: IO[bytes] = path.open("ab+")
+        try:
+            self._lock()
+            self._repair()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def append(self, record: EpisodeRecord) -> None:
+        """Write one record."""
+        self._file.write(record.to_json().encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        name_place(error, self.path)
+        try:
+            self.close()
+        except OSError:  # what a full disk did not take is tried once more on closing
+            if error is None:
+                raise
+
+    def _lock(self) -> None:
+        # The records themselves are locked, so that no other file lies beside them.
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"{self.path} is being written by another process; give every shard a file of its"
+                " own, episodes-<shard>.jsonl."
+            ) from None
+        except OSError:  # a file system without locks
+            return
+
+    def _repair(self) -> None:
+        self._file.seek(0)
+        content = self._file.read()
+        last_line = content.rpartition(b"\n")[2]
+        if not last_line:
+            return
+        try:
+            EpisodeRecord.from_json(last_line)
+        except UserError:
+            warnings.warn(
+                f"{self.path}: removed a half-written last line ({len(last_line)} bytes).",
+                stacklevel=3,
+            )
+            self._file.truncate(len(content) - len(last_line))
+        else:  # only the line's end is missing
+            self._file.write(b"\n")
+
+
+def read_records(path: Path) -> list[EpisodeRecord]:
+    """Read a file of records; a half-written last line is ignored with a warning."""
+    return read_lines(path, EpisodeRecord.from_dict, "episode records", finite=False)
 
 
 def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[EpisodeRecord]:

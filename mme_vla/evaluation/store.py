@@ -1,5 +1,5 @@
-"""The files of a run's folder: settings (`run.json`), records (`episodes.jsonl`) and claims
-(`claims/`).
+"""The files of a run's folder: settings (`run.json`), where its records are (`episodes.jsonl`), and
+claims (`claims/`).
 """
 
 import fcntl
@@ -8,27 +8,30 @@ import os
 import re
 import socket
 import time
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Self
+from typing import Any
 from urllib.parse import quote, unquote
 
 from mme_vla.config.naming import digest, flat
 from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, brief, require
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, complete_compositions, finished
+from mme_vla.evaluation.records import (
+    EpisodeKey,
+    EpisodeRecord,
+    complete_compositions,
+    finished,
+    read_records,
+)
+from mme_vla.evaluation.records import RecordLog as RecordLog
 from mme_vla.utils import (
     draft_of,
     is_alive,
     is_draft,
-    name_place,
     read_json,
-    read_lines,
     remove_drafts,
     to_json,
     verified,
@@ -164,81 +167,6 @@ def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 RECORDS = "episodes.jsonl"  # Name of a run's file; its shards are called `episodes-<shard>.jsonl`
-
-
-class RecordLog:
-    """Appends records to a file of this process, each on disk when `append` returns."""
-
-    def __init__(self, path: Path) -> None:
-        """Open or create `path`, and remove a half-written last line."""
-        self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file: IO[bytes] = path.open("ab+")
-        try:
-            self._lock()
-            self._repair()
-        except BaseException:
-            self._file.close()
-            raise
-
-    def append(self, record: EpisodeRecord) -> None:
-        """Write one record."""
-        self._file.write(record.to_json().encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        name_place(error, self.path)
-        try:
-            self.close()
-        except OSError:  # what a full disk did not take is tried once more on closing
-            if error is None:
-                raise
-
-    def _lock(self) -> None:
-        # The records themselves are locked, so that no other file lies beside them.
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(
-                f"{self.path} is being written by another process; give every shard a file of its"
-                " own, episodes-<shard>.jsonl."
-            ) from None
-        except OSError:  # a file system without locks
-            return
-
-    def _repair(self) -> None:
-        self._file.seek(0)
-        content = self._file.read()
-        last_line = content.rpartition(b"\n")[2]
-        if not last_line:
-            return
-        try:
-            EpisodeRecord.from_json(last_line)
-        except UserError:
-            warnings.warn(
-                f"{self.path}: removed a half-written last line ({len(last_line)} bytes).",
-                stacklevel=3,
-            )
-            self._file.truncate(len(content) - len(last_line))
-        else:  # only the line's end is missing
-            self._file.write(b"\n")
-
-
-def read_records(path: Path) -> list[EpisodeRecord]:
-    """Read a file of records; a half-written last line is ignored with a warning."""
-    return read_lines(path, EpisodeRecord.from_dict, "episode records", finite=False)
 
 
 def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:

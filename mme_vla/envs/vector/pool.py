@@ -370,10 +370,10 @@ def serve(plugins: Sequence[str], connection: Any, block: Any, factory: Callable
                 else:
                     continue
             except Exception as error:
-                if protocol.send_error(connection, error):
-                    continue
-                return
-            protocol.hand_over(connection, block, outcome)
+                if not protocol.send_error(connection, error):
+                    return
+            else:
+                protocol.hand_over(connection, block, outcome)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
     finally:
@@ -429,14 +429,12 @@ def make_vec_env(
             numbers = list(range(len(source.episodes(name, split))))
         for number in numbers:
             jobs.append(Job(name, split, source.episode(name, split, number).episode))
-    make: Callable[..., Any]
     shared: dict[str, Any] = {
         "action_space": action_space,
         "max_steps": max_steps,
         "render": render,
     }
+    make = partial(open_episode, env, **shared)
     if env == ROBOMME:
         make = partial(make_env, **shared, reward=reward, include=include, **scene)
-    else:
-        make = partial(open_episode, env, **shared)
     return VecEnv(jobs, workers, make, timeout)

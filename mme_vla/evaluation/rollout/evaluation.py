@@ -17,7 +17,7 @@ from mme_vla.envs.metadata import read_variant
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, counted, require
 from mme_vla.evaluation.receipts import receipt
-from mme_vla.evaluation.records import EpisodeRecord, finished, merge
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog, finished, merge, read_records
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
@@ -28,11 +28,9 @@ from mme_vla.evaluation.store import (
     INDIFFERENT,
     RECORDS,
     Claims,
-    RecordLog,
     check_run_folder,
     claim_run,
     fingerprint,
-    read_records,
 )
 from mme_vla.policy.base import Policy
 from mme_vla.policy.identity import identify_policy

@@ -23,8 +23,8 @@ from rich.progress import (
 
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, counted, printable
-from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.store import find_records, read_records
+from mme_vla.evaluation.records import EpisodeRecord, read_records
+from mme_vla.evaluation.store import find_records
 
 
 class RolloutProgress:

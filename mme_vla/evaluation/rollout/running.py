@@ -262,11 +262,12 @@ class RunningEpisode:
     @property
     def seconds(self) -> Seconds:
         """Where the time went so far."""
-        total = time.perf_counter() - self._begun
         return Seconds(
-            sim=round(self._sim, 3), render=round(self._render, 3), policy=round(self._thinking, 3),
-            total=round(total, 3),
-        )  # fmt: skip
+            sim=round(self._sim, 3),
+            render=round(self._render, 3),
+            policy=round(self._thinking, 3),
+            total=round(time.perf_counter() - self._begun, 3),
+        )
 
     @property
     def actions_sha256(self) -> str:

@@ -22,7 +22,7 @@ from mme_vla.envs.robomme.recording.frames import motions_of
 from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError, require
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RecordLog, read_records
 from mme_vla.evaluation.rollout.evaluation import (
     VIDEOS,
     EvaluationRun,
@@ -32,7 +32,7 @@ from mme_vla.evaluation.rollout.evaluation import (
     predictor_of,
 )
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
+from mme_vla.evaluation.store import RECORDS, claim_run
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.rows import CONFIG, TRAINED
 from mme_vla.extras.play.game import MAX_CHOICES, ChoiceSession

@@ -18,8 +18,8 @@ import yaml
 from mme_vla.config.sections import read_section
 from mme_vla.envs.metadata import episodes
 from mme_vla.errors import UserError, listed, require
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
-from mme_vla.evaluation.store import RECORDS, RUN_FILE, find_records, read_records, read_run
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, read_records
+from mme_vla.evaluation.store import RECORDS, RUN_FILE, find_records, read_run
 from mme_vla.policy.saving import composition_digest
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import read_json, read_text

@@ -9,10 +9,10 @@ from typing import Any, Self
 
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.scene_hash import NOT_BUILT
-from mme_vla.evaluation.records import EpisodeRecord, finished, merge
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog, finished, merge, read_records
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
-from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
+from mme_vla.evaluation.store import RECORDS, claim_run
 from mme_vla.extras.play.game import ChoiceSession
 
 
