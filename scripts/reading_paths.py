@@ -50,19 +50,19 @@ TRAINING = [
 """
 EVALUATION = [
     ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
-    ("evaluation/rollout/evaluation.py", "run"),
-    ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
-    ("envs/vector/pool.py", "serve"), ("evaluation/rollout/environment.py", "step"),
-    ("envs/make.py", "make_env"), ("envs/interface.py", "step"),
+    ("evaluation/rollout/evaluation.py", "run"), ("evaluation/rollout/runner.py", "rounds"),
+    ("envs/vector/pool.py", "recv"), ("envs/vector/pool.py", "serve"),
+    ("evaluation/rollout/environment.py", "step"), ("envs/interface.py", "step"),
     ("evaluation/rollout/running.py", "read"), ("policy/episode.py", "observe"),
     ("policy/scheduler.py", "next_steps"), ("policy/base.py", "act"),
     ("evaluation/records.py", "to_json"), ("evaluation/records.py", "append"),
 ]  # fmt: skip
-"""From the command line to the line of an episode's record; (d) continues from `act`. Beside it:
-what a terminal shows (`rollout/progress.py`), the run's folder (`store.py`: `claim_run`
-and, where several processes share a run, `Claims`), its receipt (`receipts.py`), and, where they
-are asked for, events (`rollout/events.py`), subgoals (`rollout/subgoals.py`) and videos
-(`rollout/video.py`).
+"""From the command line to the line of an episode's record; (d) continues from `act`. Before it,
+what is loaded and built: the policy (`policy/saving.py`), and the task in its scene
+(`envs/make.py`, where `make_env` returns the `RoboMMEEnv` of `envs/interface.py`). Beside it: what
+a terminal shows (`rollout/progress.py`), the run's folder (`store.py`: `claim_run`, and `Claims`
+where several processes share a run), its receipt (`receipts.py`), and, where they are asked for,
+events (`rollout/events.py`), subgoals (`rollout/subgoals.py`) and videos (`rollout/video.py`).
 """
 ALONE = "README.md"
 QUESTIONS = (

@@ -15,8 +15,11 @@ def test_the_page_on_the_layout_has_the_counted_numbers() -> None:
 
 def test_the_path_of_an_episode_passes_the_simulation_and_the_policy() -> None:
     for call in (
+        ("envs/vector/pool.py", "serve"),
         ("envs/interface.py", "step"),
         ("policy/episode.py", "observe"),
         reading_paths.SAMPLING[0],
+        ("evaluation/records.py", "append"),
     ):
         assert call in reading_paths.EVALUATION
+    assert len(reading_paths.defining(reading_paths.EVALUATION)) <= 12

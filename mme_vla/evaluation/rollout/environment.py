@@ -483,7 +483,8 @@ def base_env(
     only_possible: bool = False,
 ) -> Callable[..., Any]:
     """What makes an episode of an environment for a robot, from `task`, `split`, `episode` and
-    `max_steps`; importable by worker processes.
+    `max_steps`: a `RoboMMEEnv`, of other environments an `EpisodeEnv`. Importable by worker
+    processes.
 
     env: its name; `reward` and `only_possible` have an effect on RoboMME alone.
     """
