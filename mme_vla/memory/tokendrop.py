@@ -69,7 +69,8 @@ class TokenDrop(PerceptualMemory):
     """The `budget` highest-scored patches up to now, the first frame's among them, in
     time order.
 
-    Scorer: scores the patches, made from (grid, stride); a subclass may name another.
+    Scorer: scores the patches, made from (grid, stride). A subclass names another here, or ranks
+        the same scores in a `select` of its own (docs/extend/add-a-memory.md).
     """
 
     Scorer: ClassVar[type[Any]] = ChangeScorer

@@ -2,6 +2,7 @@
 and trains.
 """
 
+import importlib
 import json
 import os
 import re
@@ -18,6 +19,9 @@ from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
 from mme_vla.envs.rendering import render_backend
 from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.memory.history import OnlineHistory
+from mme_vla.memory.tokendrop import TokenDrop
+from mme_vla.registry import MEMORIES
 from mme_vla.testing import check_memory
 from mme_vla.testing.small import open_gates, random_batch, unit_stats
 
@@ -52,6 +56,49 @@ def test_the_pages_memory_with_a_forward_of_its_own_passes_the_check():
     )
     exec(compile(block, "docs/extend/add-a-memory.md", "exec"), {})
     check_memory("frame_means", budget=6)
+
+
+@pytest.fixture
+def rules(monkeypatch, tmp_path):
+    """The page's `rules.py`, as a module in a file."""
+    page = (REPOSITORY / "docs" / "extend" / "add-a-memory.md").read_text()
+    (block,) = (b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Contrast" in b)
+    (tmp_path / "rules.py").write_text(block)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(MEMORIES, "_entries", dict(MEMORIES._entries))
+    yield importlib.import_module("rules")
+    del sys.modules["rules"]
+
+
+@pytest.mark.parametrize("name", ["recent_changes", "contrast"])
+def test_the_pages_rules_pass_the_check(rules, name):
+    check_memory(name, budget=64, grid=4, stride=4)
+
+
+def test_a_new_ranking_keeps_the_cache_and_new_scores_have_their_own(rules):
+    released = TokenDrop(64, 32)
+    assert rules.RecentChanges(64, 32).storage == released.storage
+    assert rules.ContrastDrop(64, 32).storage.scorer.startswith("contrast-grid8-stride8-")
+
+
+def test_the_pages_rules_choose_other_patches(rules):
+    frames = np.random.default_rng(0).integers(0, 256, (41, 64, 64, 3), dtype=np.uint8)
+    frames[:] = frames[0]
+    frames[3, :16] = 0  # changes most, and long ago
+    frames[39, 48:, :8] = 128
+    chosen = []
+    for kind in (TokenDrop, rules.RecentChanges, rules.ContrastDrop):
+        memory = kind(64, 32, budget=20, grid=4, stride=4)
+        history = OnlineHistory(memory.storage, memory.make_scorer())
+        history.append(frames, torch.zeros(len(history.to_encode(41)), 16, 64))
+        chosen.append(memory.select(history, 40).tolist())
+    assert chosen[0] != chosen[1] != chosen[2] != chosen[0]
+
+
+def test_the_pages_words_make_a_rule_a_choice(rules):
+    words = ["memory=tokendrop", "memory.name=contrast", "plugins=[rules]", "integration=modulator"]
+    cfg = compose("train", words)
+    assert (cfg.plugins, cfg.memory.name, cfg.memory.budget) == (["rules"], "contrast", 512)
 
 
 def test_it_passes_the_check_that_the_page_names(policy):
