@@ -1,13 +1,15 @@
-"""Files and lines that a reader needs for seven questions about the library
+"""Files, functions and lines that a reader needs for seven questions about the library
 (docs/extend/layout.md).
 
-(a) and (e) follow imports from a starting point; the others list the files on the way. Every file
-is checked to exist, and every call of (d), (f) and (g) to be defined where it is listed.
+(a) and (d) read the tables of docs/extend/architecture.md, whose functions are counted; the others
+list the files on the way. Every file is checked to exist, and every function of (a), (d), (f) and
+(g) to be defined where it is listed.
 
     python scripts/reading_paths.py
 """
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,30 +17,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "mme_vla"
 
-MODEL = [
-    "mme_vla.model",
-    "mme_vla.backbone.pi05",
-    "mme_vla.memory.framesamp",
-    "mme_vla.integration.modulator",
-]
-"""FrameSamp + Modulator, from image to loss."""
-NOT_READ = {
-    "mme_vla",
-    "mme_vla.errors",
-    "mme_vla.memory.sizes",
-    "mme_vla.registry",
-    "mme_vla.speed",
-}
-"""Of no concern to the mathematics: messages, checks of settings, tables of names, and marks of
-what can be made faster.
-"""
+TABLES = "docs/extend/architecture.md"
+LOSS = "### One loss, step by step"
+CHUNK = "### One chunk, step by step"
+"""The functions of (a) and (d), in the order of reading."""
 SELECTION = ["memory/tokendrop.py", "memory/history.py", "memory/base.py"]
 HEAD = ["backbone/flow.py"]
-SAMPLING = [
-    ("policy/base.py", "act"), ("policy/base.py", "choose_actions"),
-    ("policy/mme.py", "predict_chunk"), ("policy/mme.py", "sample_actions"),
-    ("model.py", "sample"), ("backbone/pi05.py", "sample"),
-]  # fmt: skip
 TRAINING = [
     ("cli/train.py", "main"), ("training/settings.py", "from_config"),
     ("training/runs.py", "claim_run"), ("training/data.py", "prepare_data"),
@@ -77,36 +61,6 @@ QUESTIONS = (
 """(a) to (g), as docs/extend/layout.md has them."""
 
 
-def path_of(module: str) -> Path | None:
-    """The file of a module of the library."""
-    base = ROOT.joinpath(*module.split("."))
-    return next((p for p in (base.with_suffix(".py"), base / "__init__.py") if p.is_file()), None)
-
-
-def imports(file: Path) -> set[str]:
-    """Modules of the library that a file imports when it is imported itself."""
-    names: set[str] = set()
-    for node in ast.parse(file.read_text()).body:
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mme_vla"):
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                names.add(inner if path_of(inner) else node.module)
-    return names
-
-
-def closure(modules: list[str]) -> list[Path]:
-    """The files that these modules import, themselves included, packages without code aside."""
-    done: set[str] = set()
-    pending = [*modules]
-    while pending:
-        module = pending.pop()
-        if module not in done and (file := path_of(module)) is not None:
-            done.add(module)
-            pending += imports(file)
-    files = {file for module in done - NOT_READ if (file := path_of(module)) is not None}
-    return sorted(file for file in files if len(file.read_text().splitlines()) > 1)
-
-
 def check(files: list[Path]) -> list[Path]:
     """The files, each of which must exist."""
     if missing := [str(file) for file in files if not file.is_file()]:
@@ -114,18 +68,61 @@ def check(files: list[Path]) -> list[Path]:
     return files
 
 
+def named(file: Path, name: str) -> list[ast.FunctionDef]:
+    """The functions of a file with this name; of `Class.name`, those of that class."""
+    owner, _, function = name.rpartition(".")
+    found = []
+    for scope in ast.walk(ast.parse(file.read_text())):
+        if not isinstance(scope, ast.Module | ast.ClassDef):
+            continue
+        if owner and getattr(scope, "name", "") != owner:
+            continue
+        for node in scope.body:
+            if isinstance(node, ast.FunctionDef) and node.name == function:
+                found.append(node)
+    if not found:
+        sys.exit(f"{file} defines no {name}(); update the list that names it")
+    return found
+
+
 def defining(calls: list[tuple[str, str]]) -> list[Path]:
-    """The files of (d), (f) or (g), each of which must define its call."""
+    """The files of some functions, each of which must define its own."""
     files = check([PACKAGE / name for name, _ in calls])
     for file, (_, call) in zip(files, calls, strict=True):
-        functions = {
-            node.name
-            for node in ast.walk(ast.parse(file.read_text()))
-            if isinstance(node, ast.FunctionDef)
-        }
-        if call not in functions:
-            sys.exit(f"{file} defines no {call}(); update the lists in {Path(__file__).name}")
+        named(file, call)
     return list(dict.fromkeys(files))
+
+
+def chain(heading: str) -> list[tuple[str, str]]:
+    """The file and the name of each function in the table below a heading of `TABLES`."""
+    _, _, below = (ROOT / TABLES).read_text().partition(f"{heading}\n")
+    section, _, _ = below.partition("\n#")
+    calls = []
+    for row in section.splitlines():
+        if row.startswith("| `"):
+            _, file, functions, _ = row.split("|", 3)
+            calls += [(file.strip(" `"), name) for name in re.findall(r"`([\w.]+)`", functions)]
+    return calls
+
+
+def lines_of(calls: list[tuple[str, str]]) -> int:
+    """Lines of some functions."""
+    lines = 0
+    for file, name in calls:
+        (node,) = named(PACKAGE / file, name)
+        assert node.end_lineno is not None
+        lines += node.end_lineno - node.lineno + 1
+    return lines
+
+
+def chained(heading: str) -> tuple[str, list[Path]]:
+    """What the table below a heading takes to read, its lines rounded up to fifties, and its
+    files.
+    """
+    calls = chain(heading)
+    files = defining(calls)
+    at_most = -(-lines_of(calls) // 50) * 50
+    return f"{len(calls)} functions, at most {at_most} lines in {count(files)}", files
 
 
 def block(page: str) -> str:
@@ -158,13 +155,14 @@ def count(files: list[Path]) -> str:
 def answers() -> list[tuple[str, list[Path]]]:
     """What (a) to (g) take, and the files."""
     lines, modules = example()
-    sampled = defining(SAMPLING)
     trained = defining(TRAINING)
     evaluated = defining(EVALUATION)
-    read = [closure(MODEL), *(check([PACKAGE / n for n in names]) for names in (SELECTION, HEAD))]
+    selection, head = (check([PACKAGE / n for n in names]) for names in (SELECTION, HEAD))
     return [
-        *((count(files), files) for files in read),
-        (f"{len(SAMPLING)} calls, {count(sampled)}", sampled),
+        chained(LOSS),
+        (count(selection), selection),
+        (count(head), head),
+        chained(CHUNK),
         (f"{lines} lines, {modules} modules imported", [ROOT / ALONE]),
         (count(trained), trained),
         (count(evaluated), evaluated),

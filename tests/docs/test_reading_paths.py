@@ -13,12 +13,51 @@ def test_the_page_on_the_layout_has_the_counted_numbers() -> None:
         assert f"| {question} | {take} |" in page
 
 
+@pytest.mark.parametrize(
+    ("heading", "most", "on_the_way"),
+    [
+        (
+            reading_paths.LOSS,
+            500,
+            [
+                ("policy/network.py", "NetworkPolicy.encode_frames"),
+                ("memory/framesamp.py", "FrameSamp.select"),
+                ("model.py", "MMEModel.loss"),
+                ("integration/modulator.py", "ModulatorLayer.forward"),
+                ("backbone/flow.py", "step_loss"),
+                ("model.py", "masked_mean"),
+            ],
+        ),
+        (
+            reading_paths.CHUNK,
+            250,
+            [
+                ("policy/base.py", "Policy.act"),
+                ("policy/mme.py", "MMEPolicy.predict_chunk"),
+                ("backbone/pi05.py", "Pi05Backbone.sample"),
+                ("policy/episode.py", "executable_actions"),
+            ],
+        ),
+    ],
+)
+def test_a_table_names_functions_that_exist_in_their_order(heading, most, on_the_way) -> None:
+    calls = reading_paths.chain(heading)
+    places = [calls.index(call) for call in on_the_way]
+    assert places == sorted(places) and len(set(calls)) == len(calls)
+    assert reading_paths.lines_of(calls) <= most
+
+
+def test_a_function_that_a_file_lacks_stops_the_count() -> None:
+    with pytest.raises(SystemExit, match=r"model\.py defines no MMEModel\.encode\(\)"):
+        reading_paths.defining([("model.py", "MMEModel.encode")])
+
+
 def test_the_path_of_an_episode_passes_the_simulation_and_the_policy() -> None:
     for call in (
         ("envs/vector/pool.py", "serve"),
         ("envs/interface.py", "step"),
         ("policy/episode.py", "observe"),
-        reading_paths.SAMPLING[0],
+        ("policy/base.py", "act"),
         ("evaluation/records.py", "append"),
     ):
         assert call in reading_paths.EVALUATION
