@@ -169,8 +169,8 @@ class MMEModel(nn.Module):
         if memory is None:
             memory = self.memory_tokens(batch)
         with self.autocast():
-            rows = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
-        action = masked_mean(rows, batch.action_mask, batch.weight)
+            step_losses = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
+        action = masked_mean(step_losses, batch.action_mask, batch.weight)
 
         auxiliary: dict[str, Tensor] = {}
         if memory is not None and self.training:

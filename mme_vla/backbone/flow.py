@@ -135,7 +135,10 @@ class FlowHead:
         return noise
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
-        """The loss [b, h] of chunks [b, h, a]: squared error of the velocity."""
+        """The loss [b, h] of chunks a [b, h, a]: with noise ε and flow times τ, the network reads
+        x_τ = τε + (1 − τ)a, and the loss of a step is the mean over its numbers of (v − u)², where
+        v = predict(x_τ, τ) and u = ε − a.
+        """
         x_t, target = interpolate(actions.float(), noise["noise"], noise["time"])
         return step_loss(predict(x_t, noise["time"]), target)
 
@@ -232,7 +235,7 @@ class CleanFlowHead(FlowHead):
     """
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
-        """Squared error [b, h] of the chunk without its noise."""
+        """The loss [b, h]: the mean over a step's numbers of (predict(x_τ, τ) − a)²."""
         x_t, _ = interpolate(actions.float(), noise["noise"], noise["time"])
         return step_loss(predict(x_t, noise["time"]), actions)
 

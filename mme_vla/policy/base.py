@@ -223,7 +223,7 @@ class Policy(nn.Module):
 
     def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
         """Choose the next chunk for one episode or for many in one batch, adding nothing to their
-        memories.
+        memories. After checks it calls `choose_actions`, the last function of this file.
 
         Returns:
             float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them,

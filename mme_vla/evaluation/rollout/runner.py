@@ -207,8 +207,8 @@ class Rollout:
             self._start(worker)
         while self.envs.busy or self._scheduler:
             # While the policy has work, take what is there; else wait for the next environment.
-            timeout = 0 if self._scheduler else None
-            for reply in self.envs.recv(timeout):
+            seconds = 0 if self._scheduler else None
+            for reply in self.envs.recv(seconds):
                 self._take(reply)
             self._run_scheduler()
             yield
