@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
+from helpers import REPOSITORY
 from mme_vla import UserError, register
-from mme_vla.registry import Registry
+from mme_vla.registry import REGISTRIES, Registry
 
 
 def test_a_name_that_ships_is_not_taken_before_it_is_used() -> None:
@@ -53,3 +54,9 @@ def test_a_section_that_is_no_mapping_is_refused(section: object) -> None:
     shapes: Registry[object] = Registry("shape")
     with pytest.raises(UserError, match="section of the shape must be a section of keys"):
         shapes.build(section)  # type: ignore[arg-type]
+
+
+def test_the_page_on_methods_lists_all_kinds_of_parts() -> None:
+    page = (REPOSITORY / "docs" / "extend" / "add-a-method.md").read_text()
+    (line,) = (line for line in page.splitlines() if line.startswith("Keys of `parts`"))
+    assert [kind for kind in REGISTRIES if f"`{kind}`" not in line] == []

@@ -62,3 +62,19 @@ def test_the_path_of_an_episode_passes_the_simulation_and_the_policy() -> None:
     ):
         assert call in reading_paths.EVALUATION
     assert len(reading_paths.defining(reading_paths.EVALUATION)) <= 12
+
+
+def test_the_functions_that_end_an_episode_exist() -> None:
+    page = (REPOSITORY / "docs" / "evaluate" / "evaluation.md").read_text()
+    for file, function in (
+        ("envs/interface.py", "RoboMMEEnv._info"),
+        ("envs/interface.py", "RoboMMEEnv.step"),
+        ("evaluation/rollout/environment.py", "ChunkEnv._execute"),
+        ("envs/vector/pool.py", "serve"),
+        ("envs/vector/pool.py", "Reply.of_failure"),
+        ("envs/vector/pool.py", "VecEnv._replace"),
+        ("evaluation/rollout/runner.py", "Rollout._act"),
+        ("evaluation/rollout/runner.py", "Rollout._finish"),
+    ):
+        assert f"`{function}`" in page
+        assert reading_paths.named(reading_paths.PACKAGE / file, function)

@@ -141,7 +141,8 @@ class VecEnv:
         factory: makes an environment from `task`, `split` and `episode`; importable by name, or a
             `partial` of such a function with its further arguments.
         timeout: seconds after which a command without result counts as hung, and its worker is
-            replaced.
+            replaced. The wait of `recv`, and the outcome `timeout` of an episode (its step limit),
+            are other things.
     """
 
     def __init__(
@@ -223,7 +224,8 @@ class VecEnv:
         with `crashed` and the status `error`; the others continue.
 
         Args:
-            timeout: seconds to wait at most; None waits as long as commands may take.
+            timeout: seconds that this call waits at most, whatever hangs; None waits as long as
+                commands may take.
 
         Returns:
             Replies in the order of the workers; empty when the time is up or nothing is under way.

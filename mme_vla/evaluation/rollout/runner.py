@@ -111,7 +111,7 @@ class Workload:
 
 @dataclass(frozen=True)
 class Ending:
-    """How an episode ended.
+    """How an episode ended (docs/evaluate/evaluation.md lists causes).
 
     outcome: `success`, `fail`, `timeout` or `error`.
     reason: the error, or of another outcome why the last action was refused; None without one.
