@@ -86,13 +86,13 @@ def test_the_pages_rules_choose_other_patches(rules):
     frames[:] = frames[0]
     frames[3, :16] = 0  # changes most, and long ago
     frames[39, 48:, :8] = 128
-    chosen = []
+    selections = []
     for kind in (TokenDrop, rules.RecentChanges, rules.ContrastDrop):
         memory = kind(64, 32, budget=20, grid=4, stride=4)
         history = OnlineHistory(memory.storage, memory.make_scorer())
         history.append(frames, torch.zeros(len(history.to_encode(41)), 16, 64))
-        chosen.append(memory.select(history, 40).tolist())
-    assert chosen[0] != chosen[1] != chosen[2] != chosen[0]
+        selections.append(memory.select(history, 40).tolist())
+    assert selections[0] != selections[1] != selections[2] != selections[0]
 
 
 def test_the_pages_words_make_a_rule_a_choice(rules):
