@@ -81,6 +81,21 @@ def benchmark_action(
     return action[:width]
 
 
+def choice_action(space: ActionSpace, choice: Mapping[str, Any]) -> np.ndarray:
+    """A choice as an action [w] float32 of a policy: the inverse of `benchmark_action`.
+
+    Args:
+        choice: `{"choice": "A", "point": [y, x]}`, in pixels of the front image; `point` is absent,
+            None or empty for a choice that needs none.
+    """
+    action = np.zeros(space.width, np.float32)
+    action[space.choice[ascii_uppercase.index(str(choice["choice"]).upper())]] = 1
+    if space.point:
+        point = choice.get("point") or ()
+        action[list(space.point)] = np.divide(point, SIDE) if len(point) else MIDDLE
+    return action
+
+
 def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
     """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of
     the image.

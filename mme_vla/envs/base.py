@@ -11,8 +11,9 @@ which become the conditioning video), `frozen` (on reset: steps in which no acti
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
+from string import ascii_lowercase
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -26,12 +27,14 @@ from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import UserError, check_known, listed, require
 from mme_vla.registry import ENVS
 
-Actions = Sequence[Any]
-"""Actions that `step` takes, one after the other."""
+Actions = Iterable[Any]
+"""Actions that `step` takes, one after the other. Those of a generator are asked for one by one, so
+that each can depend on what the one before has changed.
+"""
 CHOICES = "multi_choice"
+OPTIONS = "available_multi_choices"
 _FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
 _OTHER_SPLITS = 2_000_000  # first seed of splits with other names
-_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _MAX_IDLE = 4  # environments that a process keeps for further episodes
 
 
@@ -106,8 +109,8 @@ class Environment(ABC):
         )
 
     def choices(self, env: Any) -> Mapping[str, Actions]:
-        """What can be chosen in `play` now: text → the actions that carry it out.
-        Empty: nothing.
+        """What can be chosen now, by policies whose actions are choices and in `play`: text → the
+        actions that carry it out. Empty: nothing.
         """
         return {}
 
@@ -383,17 +386,20 @@ class EpisodeEnv:
             self._limit += action.steps
         elif self._by_choice:
             parts = self._choices[action["choice"].lower()]
+        remaining = iter(parts)
+        part = next(remaining, None)
+        require(part is not None, f"{self.spec.task}: what was chosen has no actions.")
         frames = []
         total = 0.0
-        for number, part in enumerate(parts, 1):
+        while part is not None:
             observation, reward, terminated, truncated, info = self._perform(part)
             total += float(reward)
             self._steps += 1
             truncated = bool(truncated) or self._steps >= self._limit
-            over = terminated or truncated
-            frames.append(self._read_frame(observation, newest=bool(over) or number == len(parts)))
-            if over:
-                break
+            part = None
+            if not (terminated or truncated):
+                part = next(remaining, None)
+            frames.append(self._read_frame(observation, newest=part is None))
         report = self._info(info, bool(terminated), truncated)
         return self._lists(frames), total, bool(terminated), truncated, report
 
@@ -579,15 +585,19 @@ class EpisodeEnv:
             choices = dict(self.environment.choices(self.env))
             name = type(self.environment).__name__
             require(choices, f"{name} offers no choices to play: implement choices(env).")
-            empty = [text for text, actions in choices.items() if not len(actions)]
             require(
-                not empty,
-                f"{name}.choices(env) has no actions for {empty[:1]}: leave it out, or add one.",
+                len(choices) <= len(ascii_lowercase),
+                f"{name}.choices(env) has {len(choices)} entries, and there are"
+                f" {len(ascii_lowercase)} letters.",
             )
             self._choices = {}
             options = []
-            for letter, (text, actions) in zip(_LETTERS, choices.items(), strict=False):
+            for letter, (text, actions) in zip(ascii_lowercase, choices.items(), strict=False):
+                require(
+                    not isinstance(actions, Sized) or len(actions),
+                    f"{name}.choices(env) has no actions for {text!r}: leave it out, or add one.",
+                )
                 self._choices[letter] = actions
                 options.append(Option(letter, text).to_dict())
-            report["available_multi_choices"] = options
+            report[OPTIONS] = options
         return report

@@ -16,8 +16,14 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
-from mme_vla.envs.base import EpisodeEnv, Hold, environment, open_episode
+from mme_vla.embodiment.robomme import (
+    CAMERAS,
+    SIDE,
+    benchmark_action,
+    benchmark_state,
+    choice_action,
+)
+from mme_vla.envs.base import OPTIONS, EpisodeEnv, Hold, environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
 from mme_vla.envs.metadata import BASE, DEFAULT_STEPS, STICK_TASKS
 from mme_vla.envs.observations import Include, RenderRequest
@@ -28,7 +34,6 @@ from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
-OPTIONS = "available_multi_choices"
 SUBGOAL = "simple_subgoal_online"
 REPORTED = (
     "status", "task_goal", SUBGOAL, "grounded_subgoal_online", "error_message", "exception_type",
@@ -361,7 +366,7 @@ class ChunkEnv:
             subtask = min(score.done + 1, score.of)
         oracle = None
         if self._oracle and status == "ongoing" and (choice := oracle_of(self._env)) is not None:
-            oracle = choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
+            oracle = choice_action(self._robot.action, choice)
         report = Report(
             status=status,
             goal=self._goal,

@@ -99,14 +99,22 @@ def place_of(thing: Any) -> np.ndarray:
 
 
 def touch(hand: Hand) -> Actions:
-    """Remember* and FindImposter*: bring the hand over the right object, so near that it counts."""
-    while True:
-        offset = hand.scene.obj_to_goal_pos[0].cpu().numpy()  # from the hand, in the world
-        offset = offset + _up(_OVER)
+    """Remember* and FindImposter*: touch the right object."""
+    # from the hand, in the world
+    return touch_thing(hand, lambda: hand.scene.obj_to_goal_pos[0].cpu().numpy())
+
+
+def touch_thing(hand: Hand, offset: Callable[[], np.ndarray]) -> Actions:
+    """Bring the hand over an object, so near that it counts, and stay there.
+
+    offset: from the hand to the object [3], metres, read anew at each step.
+    """
+    for _ in range(_TOUCH_STEPS):
         # In every direction as fast as it goes: there are few steps
-        yield hand.action(np.clip(offset, -REACH, REACH), gripper=OPEN)
+        yield hand.action(np.clip(offset() + _up(_OVER), -REACH, REACH), gripper=OPEN)
 
 
+_TOUCH_STEPS = 40  # the longest of these episodes
 _OVER = 0.025  # metres over the middle of an object; a touch counts within 0.05
 _ABOVE_CUBE = 0.012  # metres over the point that counts, less than the radius of a touch
 TRAVEL = 0.16  # height at which the hand passes over cubes and button
@@ -114,18 +122,28 @@ TRAVEL = 0.16  # height at which the hand passes over cubes and button
 
 def touch_several(hand: Hand) -> Actions:
     """Bunch, Seq and ChainOfColors: touch the cubes one after the other, and press the button."""
-    scene = hand.scene
     yield from hand.hold(6, CLOSED)  # cubes are put back into place for some steps
-    for key in scene.true_color_indices[0].tolist():
-        cube = scene.cubes[key]
-        top = place_of(cube) + _up(scene.CUBE_HALFSIZE + 0.005 + _ABOVE_CUBE)
-        above = np.array([top[0], top[1], TRAVEL])
-        yield from hand.go(hand.position * [1, 1, 0] + _up(TRAVEL), 0.03, CLOSED)
-        yield from hand.go(above, 0.02, CLOSED)
-        for _ in range(30):
-            if bool(scene.touched_cubes[0, key]):
-                break
-            yield hand.action(0.7 * (top - hand.position), gripper=CLOSED)
+    for key in hand.scene.true_color_indices[0].tolist():
+        yield from touch_cube(hand, key)
+    yield from press_button(hand)
+
+
+def touch_cube(hand: Hand, key: int) -> Actions:
+    """Bunch, Seq and ChainOfColors: touch a cube from above, and rise again."""
+    scene = hand.scene
+    top = place_of(scene.cubes[key]) + _up(scene.CUBE_HALFSIZE + 0.005 + _ABOVE_CUBE)
+    yield from hand.go(hand.position * [1, 1, 0] + _up(TRAVEL), 0.03, CLOSED)
+    yield from hand.go(np.array([top[0], top[1], TRAVEL]), 0.02, CLOSED)
+    for _ in range(30):
+        if bool(scene.touched_cubes[0, key]):
+            break
+        yield hand.action(0.7 * (top - hand.position), gripper=CLOSED)
+    yield from hand.go(hand.position * [1, 1, 0] + _up(TRAVEL), 0.03, CLOSED)
+
+
+def press_button(hand: Hand) -> Actions:
+    """Bunch, Seq and ChainOfColors: press the button, and rise as far as is required."""
+    scene = hand.scene
     button = np.array([*scene.button_xy[0].tolist(), float(scene.button_top_z[0])])
     yield from hand.go(hand.position * [1, 1, 0] + _up(TRAVEL), 0.03, CLOSED)
     yield from hand.go(button * [1, 1, 0] + _up(TRAVEL), 0.02, CLOSED)
@@ -137,12 +155,18 @@ def touch_several(hand: Hand) -> Actions:
 
 
 def take_back(hand: Hand) -> Actions:
-    """TakeItBack: carry the cube to the target, and back to where it was.
+    """TakeItBack: carry the cube to the target, and back to where it was."""
+    begin = place_of(hand.scene.initial_region)
+    yield from carry_to_target(hand)
+    yield from carry(hand, begin)
+
+
+def carry_to_target(hand: Hand) -> Actions:
+    """TakeItBack: take the cube to the target, until it counts as reached.
 
     The target is at the end of the arm's reach, so the hand leans outward on the way there.
     """
     scene = hand.scene
-    begin = place_of(scene.initial_region)
     goal = place_of(scene.goal_region)
     yield from grasp(hand, lambda: place_of(scene.cube))
     for _ in range(25):
@@ -151,8 +175,12 @@ def take_back(hand: Hand) -> Actions:
         action = hand.action(_level(goal - hand.position, _EDGE), gripper=CLOSED)
         action[4] = 1.0
         yield action
+
+
+def carry(hand: Hand, place: np.ndarray) -> Actions:
+    """TakeItBack: bring what the hand holds to a place [3]."""
     for _ in range(30):
-        yield hand.action(_level(begin - hand.position, REACH), gripper=CLOSED)
+        yield hand.action(_level(place - hand.position, REACH), gripper=CLOSED)
 
 
 _EDGE = (

@@ -1,5 +1,5 @@
-"""MIKASA-Robo-VLA 1.0.0 by its protocol: `env=mikasa`, and `env=mikasa_video`, where the cue is a
-conditioning video.
+"""MIKASA-Robo-VLA 1.0.0 by its protocol: `env=mikasa`, `env=mikasa_video`, where the cue is a
+conditioning video, and `env=mikasa_choices`, where actions are choices as well.
 
 Its tasks are ManiSkill environments and run on the library's ManiSkill. The package's wrappers are
 not used: what they do (cameras, state, no motion while a cue is shown) is done here, with images on
@@ -9,16 +9,17 @@ demand.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from string import ascii_lowercase
 from typing import Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
 
-from mme_vla.envs.base import Environment
+from mme_vla.envs.base import CHOICES, Actions, Environment
 from mme_vla.envs.facts import Candidates, Fact, FactLog
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.rendering import keep_renderer, lean_shaders, links_culled, render_backend
-from mme_vla.errors import check_known
+from mme_vla.errors import check_known, require
 from mme_vla.extras.mikasa.assets import check_assets, check_package, is_there
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS, by_horizon, by_memory
 from mme_vla.extras.mikasa.demonstrators import demonstrate, place_of
@@ -39,13 +40,16 @@ class MikasaScene(gymnasium.Env[Any, Any]):
     Attributes:
         scene: the task itself.
         time: steps since the reset.
-        frozen: first steps in which no action has an effect.
+        frozen: first steps in which no action has an effect, by the protocol, or while a cue is
+            shown in any task (`by_choice`).
         cue_end: the first step at which the answer can be given.
         scene_facts: what its frames show.
         log: the facts of those so far.
     """
 
-    def __init__(self, task: str, render: bool, is_twin: bool = False) -> None:
+    def __init__(
+        self, task: str, render: bool, is_twin: bool = False, by_choice: bool = False
+    ) -> None:
         check_assets(task)
         import mani_skill.envs  # noqa: F401
         import mikasa_robo_suite.vla.memory_envs  # noqa: F401  registers the tasks
@@ -69,7 +73,8 @@ class MikasaScene(gymnasium.Env[Any, Any]):
             keep_renderer(self.scene._render_device)
         self._task = task
         self._is_twin = is_twin
-        self._freezes = FAMILY_OF[task].frozen and not task.endswith("-Long")
+        self._by_choice = by_choice
+        self._freezes = by_choice or (FAMILY_OF[task].frozen and not task.endswith("-Long"))
         self.time = 0
 
     @contextmanager
@@ -109,7 +114,7 @@ class MikasaScene(gymnasium.Env[Any, Any]):
             if hasattr(self.scene, name):
                 self.cue_end += int(getattr(self.scene, name)[0])
         self.frozen = self.cue_end if self._freezes else 0
-        self.scene_facts = facts_of_task(self._task)(self.scene, self.cue_end)
+        self.scene_facts = facts_of_task(self._task)(self.scene, self.cue_end, self._by_choice)
         if self._is_twin:
             self.scene_facts.flip()
             self.scene.get_info()  # which places what is shown
@@ -166,6 +171,10 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         taken = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
         image: np.ndarray = taken["rgb"][0].cpu().numpy()
         return image
+
+    def oracle(self) -> dict[str, str]:
+        """The choice that leads to success."""
+        return {"choice": ascii_lowercase[self.scene_facts.right_choice()]}
 
     def close(self) -> None:
         """Free the simulator."""
@@ -224,6 +233,9 @@ class Mikasa(Environment):
         self.check_installed()
         return MikasaScene(spec.task, render, is_twin=spec.row is not None)
 
+    def choices(self, env: MikasaScene) -> Mapping[str, Actions]:
+        return env.scene_facts.choices()
+
     def hold(self, env: MikasaScene) -> np.ndarray:
         """No motion; the gripper stays open, as it is in every scene's beginning."""
         return np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
@@ -258,3 +270,49 @@ class MikasaVideo(Mikasa):
         "name": "mikasa_video",
         "conditioning_video": True,
     }
+
+
+_LETTERS = ascii_lowercase[:15]  # as many objects as RememberShapeAndColor5x3 has
+
+
+@ENVS.register("mikasa_choices")
+class MikasaChoices(MikasaVideo):
+    """The tasks whose answer is one of several things, by choices: an action is the letter of an
+    option, which a script carries out. The cue of every task is a conditioning video.
+    """
+
+    embodiment: ClassVar[Mapping[str, Any]] = {
+        "name": "mikasa_choices",
+        "cameras": {"top": {"augment": "colour"}},
+        "memory_camera": "top",
+        "state": {"width": 7},
+        "action": {
+            "space": CHOICES,
+            "width": len(_LETTERS),
+            "names": list(_LETTERS),
+            "choice": list(range(len(_LETTERS))),
+            "options_length": 160,
+            "horizon": 4,
+            "execute": 1,
+            "frames": None,
+        },
+        "fps": 10,
+        "conditioning_video": True,
+    }
+
+    @property
+    def tasks(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Those with something to choose, whose models are on this machine."""
+        return tuple(task for task in super().tasks if facts_of_task(task).has_twin)
+
+    def check_task(self, task: str) -> None:
+        """A task with something to choose, whose models are on this machine."""
+        super().check_task(task)
+        require(
+            facts_of_task(task).has_twin,
+            f"{task} has nothing to choose: take env=mikasa, or one of {', '.join(self.tasks)}.",
+        )
+
+    def make(self, spec: EpisodeSpec, render: bool = True) -> MikasaScene:
+        self.check_installed()
+        return MikasaScene(spec.task, render, is_twin=spec.row is not None, by_choice=True)

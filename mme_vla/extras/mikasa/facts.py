@@ -1,16 +1,28 @@
 """What the tasks of MIKASA-Robo-VLA show and need later, from the simulator's state: one class for
-each kind of scene, its facts and the fact that a twin flips.
+each kind of scene, its facts, the fact that a twin flips, and what can be chosen.
 
 Tasks whose models the package lacks have none: `SceneFacts`.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
 from mme_vla.envs.facts import Candidates, VisibleFact
-from mme_vla.extras.mikasa.demonstrators import TRAVEL, place_of, wrapped
+from mme_vla.extras.mikasa.demonstrators import (
+    TRAVEL,
+    Actions,
+    Hand,
+    carry,
+    carry_to_target,
+    place_of,
+    press_button,
+    touch_cube,
+    touch_thing,
+    wrapped,
+)
 
 _COLORS = ("red", "lime", "blue")  # of shapes in colours, by their `color_id`
 _NEAR = 0.1  # metres from the hand to a thing that it touches, or has just touched
@@ -25,13 +37,16 @@ class SceneFacts:
     Args:
         scene: has been reset; it is read at each frame.
         cue_end: the first step at which the answer can be given.
+        by_choice: whether each decision is about a whole movement, wherever the hand is.
     """
 
     has_twin: ClassVar[bool] = False
+    """Whether the answer is one of several things: it can be flipped, and chosen."""
 
-    def __init__(self, scene: Any, cue_end: int) -> None:
+    def __init__(self, scene: Any, cue_end: int, by_choice: bool = False) -> None:
         self._scene = scene
         self._cue_end = cue_end
+        self._by_choice = by_choice
 
     def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         """What the next frame shows, and whether a decision begins there that depends on the facts.
@@ -46,6 +61,19 @@ class SceneFacts:
     def candidates(self, time: int) -> Candidates | None:
         """What the hand can go to, once the flipped fact decides which is right."""
         return None
+
+    def choices(self) -> Mapping[str, Actions]:
+        """What can be chosen, the same at every moment: text → the actions that do it."""
+        return {}
+
+    def right_choice(self) -> int:
+        """The number, among the choices, of the one that leads to success."""
+        raise NotImplementedError
+
+
+def _offset(hand: Hand, thing: Any) -> np.ndarray:
+    """From the hand to a thing [3], metres."""
+    return place_of(thing) - hand.position
 
 
 class Recall(SceneFacts):
@@ -85,6 +113,12 @@ class Recall(SceneFacts):
             return str(scene.shape_dict[key])
         return str(scene.COLOR_MAPPING[key][0]).lower()
 
+    def _described(self, key: int) -> str:
+        """An object in words: its colour, its shape, or both."""
+        if hasattr(self._scene, "shape_actors"):
+            return self._name(key)
+        return f"{self._name(key)} cube"
+
     def _shown(self, time: int) -> Sequence[int]:
         """Keys of the objects that are shown."""
         if time >= int(self._scene.cue_steps_per_env[0]):
@@ -111,6 +145,17 @@ class Recall(SceneFacts):
             return None
         return self._among(list(self._things), self._answers[0])
 
+    def choices(self) -> Mapping[str, Actions]:
+        hand = Hand(self._scene)
+        choices = {}
+        for key, thing in self._things.items():
+            text = f"touch the {self._described(key)}"
+            choices[text] = touch_thing(hand, partial(_offset, hand, thing))
+        return choices
+
+    def right_choice(self) -> int:
+        return list(self._things).index(self._answers[0])
+
     def _among(self, keys: Sequence[int], right: int) -> Candidates:
         """These objects, of which one is right."""
         places = [place_of(self._things[key])[:2].tolist() for key in keys]
@@ -127,8 +172,8 @@ class Several(Recall):
 
     _in_order: ClassVar[bool] = False
 
-    def __init__(self, scene: Any, cue_end: int) -> None:
-        super().__init__(scene, cue_end)
+    def __init__(self, scene: Any, cue_end: int, by_choice: bool = False) -> None:
+        super().__init__(scene, cue_end, by_choice)
         self._touched: list[int] = []
 
     def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
@@ -155,8 +200,12 @@ class Several(Recall):
                 visible[f"touch {len(self._touched)}"] = fact
         return visible, time == self._cue_end or bool(new)
 
-    def _is_lifted(self, time: int) -> bool:
-        """Whether the hand is at the height at which it passes over cubes, after the cue."""
+    def _is_free(self, time: int) -> bool:
+        """Whether the hand can go to any cube next, after the cue: of motions where it is at the
+        height at which it passes over cubes.
+        """
+        if self._by_choice:
+            return time >= self._cue_end
         height = float(place_of(self._scene.agent.tcp)[2])
         return time >= self._cue_end and abs(height - TRAVEL) < 0.03
 
@@ -167,9 +216,24 @@ class Several(Recall):
 
     def candidates(self, time: int) -> Candidates | None:
         *former, last = self._answers
-        if not self._is_lifted(time) or set(former) - set(self._touched):
+        if not self._is_free(time) or set(former) - set(self._touched):
             return None
         return self._among([key for key in self._things if key not in former], last)
+
+    def choices(self) -> Mapping[str, Actions]:
+        hand = Hand(self._scene)
+        choices = {}
+        for key in self._things:
+            choices[f"touch the {self._described(key)}"] = touch_cube(hand, key)
+        choices["press the button"] = press_button(hand)
+        return choices
+
+    def right_choice(self) -> int:
+        touched = self._scene.touched_cubes[0]
+        for key in self._answers:
+            if not bool(touched[key]):
+                return list(self._things).index(key)
+        return len(self._things)
 
 
 class InOrder(Several):
@@ -183,7 +247,7 @@ class InOrder(Several):
         self._right[0, :2] = self._right[0, :2].flip(0)
 
     def candidates(self, time: int) -> Candidates | None:
-        return Recall.candidates(self, time) if self._is_lifted(time) else None
+        return Recall.candidates(self, time) if self._is_free(time) else None
 
 
 class Origin(SceneFacts):
@@ -222,6 +286,20 @@ class Origin(SceneFacts):
         column = self._column()
         places = [[x, y + (other - column) * _COLUMN] for other in range(3)]
         return Candidates(places, [column])
+
+    def choices(self) -> Mapping[str, Actions]:
+        hand = Hand(self._scene)
+        choices = {"carry the cube to the target": carry_to_target(hand)}
+        begin = place_of(self._scene.initial_region)
+        for number, name in enumerate(_COLUMNS):
+            place = begin + np.array([0, (number - self._column()) * _COLUMN, 0])
+            choices[f"bring the cube back to the {name}"] = carry(hand, place)
+        return choices
+
+    def right_choice(self) -> int:
+        if not bool(self._scene.goal_reached_status[0]):
+            return 0
+        return 1 + self._column()
 
 
 class Turned(SceneFacts):

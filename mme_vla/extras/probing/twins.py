@@ -19,7 +19,7 @@ import numpy as np
 from mme_vla.config.sections import read_section
 from mme_vla.data.console import progress
 from mme_vla.embodiment import Embodiment
-from mme_vla.embodiment.robomme import choice_row
+from mme_vla.embodiment.robomme import choice_action
 from mme_vla.envs.base import CHOICES, EpisodeEnv, environment
 from mme_vla.envs.facts import Candidates
 from mme_vla.envs.make import make_env, make_task
@@ -303,7 +303,7 @@ def _script(base: Any, spec: EpisodeSpec, robot: Embodiment) -> Iterator[np.ndar
     """Actions [w] of a demonstrator, one for each step that the caller performs in between."""
     if robot.action.space == CHOICES:
         while (choice := oracle_of(base)) is not None:
-            yield choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
+            yield choice_action(robot.action, choice)
     elif isinstance(base, EpisodeEnv):
         for action in base.environment.demonstrate(base.env):
             yield np.asarray(action, np.float32)

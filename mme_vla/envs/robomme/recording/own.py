@@ -9,15 +9,19 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.envs.base import Environment
+from mme_vla.data.lerobot_files import SIDE_FILE
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.robomme import choice_action
+from mme_vla.envs.base import CHOICES, OPTIONS, Environment, EpisodeEnv
 from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError, counted
-from mme_vla.utils import parse_json, write_atomically
+from mme_vla.utils import parse_json, write_atomically, write_json
 
 STATE = "observation.state"
 ACTION = "action"
 IMAGES = "observation.images."
+IS_DEMO = "is_demo"
 DRAFT = "dataset"
 
 
@@ -36,8 +40,8 @@ def record_own(
     """Demonstrate episodes into a new dataset; those that do not succeed are left out.
 
     The columns are `observation.images.<camera>`, `observation.state`, `action`, and `is_demo` for
-    the frames of a conditioning video. `meta/facts.csv` has the facts. `output` appears when it is
-    whole.
+    the frames of a conditioning video. `meta/facts.csv` has the facts, and the side file the
+    options of an environment whose robot acts by choices. `output` appears when it is whole.
 
     Args:
         work: folder that keeps each episode until then; those in it are not demonstrated again.
@@ -62,13 +66,17 @@ def record_own(
                         np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             advance(1)
         tables: list[tuple[int, str, list[Fact]]] = []
+        records: list[dict[str, Any]] = []  # of episodes with options
         for path in filter(Path.is_file, episodes):
             with np.load(path) as loaded:
                 columns = dict(loaded)
             goal = str(columns.pop("task"))
             # An earlier version kept no facts.
             facts = parse_json(str(columns.pop("facts", "[]")), str(path), list)
+            options = parse_json(str(columns.pop("options", "[]")), str(path), list)
             task = episodes[path].task
+            if options:
+                records.append({"task": task, "options": options})
             tables.append((len(tables), task, [Fact.from_dict(fact) for fact in facts]))
             length = len(columns[STATE])
             for frame in range(length):
@@ -87,33 +95,85 @@ def record_own(
             )
         dataset.finalize()
     write_facts(draft / FACTS, tables)
+    if records:
+        write_json(draft / SIDE_FILE, {"episodes": records}, indent=None)
     draft.rename(output)
     return frames, failures
 
 
 def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.ndarray] | None:
-    """The columns of an episode [frames, …] and its `task`; None where it did not succeed."""
-    env = environment.open(spec.task, spec.split, spec.episode)
+    """The columns of an episode [frames, …], its `task`, `facts` and `options`; None where it did
+    not succeed.
+    """
+    robot = None
+    space = None
+    if environment.embodiment is not None:
+        robot = Embodiment.from_dict(environment.embodiment)
+        space = robot.action.space
+    env = environment.open(spec.task, spec.split, spec.episode, action_space=space)
     try:
-        rows: list[dict[str, np.ndarray]] = []
-        for observation, action, visible in env.demonstration():
-            row = {}
-            for name, value in observation.items():
-                if name != "state":
-                    row[f"{IMAGES}{name}"] = np.asarray(value)
-            row[STATE] = np.asarray(observation["state"], np.float32)
-            row[ACTION] = np.asarray(action, np.float32)
-            row["is_demo"] = np.array([visible])
-            rows.append(row)
-        if not env.success:
+        options: list[dict[str, Any]] = []
+        if robot is not None and space == CHOICES:
+            columns, options, success = _by_choices(env, robot)
+        else:
+            columns = _by_motions(env)
+            success = env.success
+        if not success:
             return None
-        facts = json.dumps([fact.to_dict() for fact in env.facts])
-        columns = {"task": np.array(env.goal), "facts": np.array(facts)}
-        for name in rows[0]:
-            columns[name] = np.stack([row[name] for row in rows])
+        columns["task"] = np.array(env.goal)
+        columns["facts"] = np.array(json.dumps([fact.to_dict() for fact in env.facts]))
+        columns["options"] = np.array(json.dumps(options))
         return columns
     finally:
         env.close()
+
+
+def _by_motions(env: EpisodeEnv) -> dict[str, np.ndarray]:
+    """The columns of a demonstration, an action for each frame."""
+    rows: list[dict[str, np.ndarray]] = []
+    for observation, action, visible in env.demonstration():
+        row = {}
+        for name, value in observation.items():
+            if name != "state":
+                row[f"{IMAGES}{name}"] = np.asarray(value)
+        row[STATE] = np.asarray(observation["state"], np.float32)
+        row[ACTION] = np.asarray(action, np.float32)
+        row[IS_DEMO] = np.array([visible])
+        rows.append(row)
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def _by_choices(
+    env: EpisodeEnv, robot: Embodiment
+) -> tuple[dict[str, np.ndarray], list[dict[str, Any]], bool]:
+    """The columns of what the environment's oracle chooses, the options, and whether it succeeds.
+
+    A choice is in the column of actions at the first frame that follows its decision, the first one
+    at the frame of the decision itself; all other rows are 0 (`find_motions`).
+    """
+    received, report = env.reset()
+    options: list[dict[str, Any]] = report.get(OPTIONS, [])
+    parts = [received]
+    video = length = len(received["state_list"])
+    chosen: dict[int, np.ndarray] = {}
+    while report["status"] == "ongoing":
+        choice = env.oracle()
+        if choice is None:
+            raise UserError(f"{env.spec.task}: the oracle has no choice.")
+        chosen[length if chosen else length - 1] = choice_action(robot.action, choice)
+        received, *_, report = env.step(choice)
+        parts.append(received)
+        length += len(received["state_list"])
+
+    columns = {STATE: np.concatenate([part["state_list"] for part in parts])}
+    for camera in robot.camera_names:
+        images = [part[f"{camera}_rgb_list"] for part in parts]
+        columns[f"{IMAGES}{camera}"] = np.concatenate(images)
+    columns[ACTION] = np.zeros((length, robot.action.width), np.float32)
+    for frame, action in chosen.items():
+        columns[ACTION][frame] = action
+    columns[IS_DEMO] = np.arange(length)[:, None] < video - 1
+    return columns, options, report["status"] == "success"
 
 
 def _create(
@@ -125,7 +185,7 @@ def _create(
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    features: dict[str, Any] = {"is_demo": {"dtype": "bool", "shape": (1,), "names": None}}
+    features: dict[str, Any] = {IS_DEMO: {"dtype": "bool", "shape": (1,), "names": None}}
     for name, value in row.items():
         if name.startswith(IMAGES):
             features[name] = {
