@@ -283,8 +283,9 @@ class MikasaChoices(MikasaVideo):
 
     embodiment: ClassVar[Mapping[str, Any]] = {
         "name": "mikasa_choices",
-        "cameras": {"top": {"augment": "colour"}},
-        "memory_camera": "top",
+        # It looks down from above all objects, which are twice as large in its images as in `top`.
+        "cameras": {"wrist": {"augment": "none"}},
+        "memory_camera": "wrist",
         "state": {"width": 7},
         "action": {
             "space": CHOICES,

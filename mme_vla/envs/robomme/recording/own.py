@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from mme_vla.embodiment.robomme import choice_action
 from mme_vla.envs.base import CHOICES, OPTIONS, Environment, EpisodeEnv
 from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import UserError, counted
 from mme_vla.utils import parse_json, write_atomically, write_json
 
@@ -151,6 +153,8 @@ def _by_choices(
     A choice is in the column of actions at the first frame that follows its decision, the first one
     at the frame of the decision itself; all other rows are 0 (`find_motions`).
     """
+    every_frame = dict.fromkeys(robot.camera_names, range(sys.maxsize))
+    env.render_request = RenderRequest(every_frame, now=())
     received, report = env.reset()
     options: list[dict[str, Any]] = report.get(OPTIONS, [])
     parts = [received]
