@@ -62,6 +62,10 @@ class SceneFacts:
         """What the hand can go to, once the flipped fact decides which is right."""
         return None
 
+    def things(self) -> Mapping[str, Any]:
+        """What the answer is one of: an object in words → the simulator's actor."""
+        return {}
+
     def choices(self) -> Mapping[str, Actions]:
         """What can be chosen, the same at every moment: text → the actions that do it."""
         return {}
@@ -145,12 +149,14 @@ class Recall(SceneFacts):
             return None
         return self._among(list(self._things), self._answers[0])
 
+    def things(self) -> Mapping[str, Any]:
+        return {self._described(key): thing for key, thing in self._things.items()}
+
     def choices(self) -> Mapping[str, Actions]:
         hand = Hand(self._scene)
         choices = {}
-        for key, thing in self._things.items():
-            text = f"touch the {self._described(key)}"
-            choices[text] = touch_thing(hand, partial(_offset, hand, thing))
+        for name, thing in self.things().items():
+            choices[f"touch the {name}"] = touch_thing(hand, partial(_offset, hand, thing))
         return choices
 
     def right_choice(self) -> int:
@@ -286,6 +292,9 @@ class Origin(SceneFacts):
         column = self._column()
         places = [[x, y + (other - column) * _COLUMN] for other in range(3)]
         return Candidates(places, [column])
+
+    def things(self) -> Mapping[str, Any]:
+        return {"cube": self._scene.cube}
 
     def choices(self) -> Mapping[str, Actions]:
         hand = Hand(self._scene)

@@ -255,7 +255,10 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         # The tower comes first: with one seed it is the same in every variant, and so is a cache
         # made by it.
         sizes = tower.widths, tower.blocks
-        self.vision = PlaceTower(*sizes) if tower.layout == "places" else ConvTower(*sizes, width)
+        if tower.layout == "places":
+            self.vision = PlaceTower(*sizes, tower.in_use)
+        else:
+            self.vision = ConvTower(*sizes, width)
         self.goal_reader = GoalReader(config) if config.goal == "text" else None
         self.spare = 0
         if self.goal_reader is not None:

@@ -115,7 +115,7 @@ class Scenes:
 def fresh_tower(config: TowerConfig, seed: int) -> PlaceTower:
     """A tower with random weights that reports nothing yet."""
     torch.manual_seed(seed)
-    tower = PlaceTower(config.widths, config.blocks)
+    tower = PlaceTower(config.widths, config.blocks, config.in_use)
     initialise(tower)
     nn.init.constant_(tower.out.bias[: len(CLASSES)], EMPTY)  # type: ignore[index]  # it has a bias
     return tower
@@ -204,8 +204,7 @@ def tower_loss(
 
 def pretrain(
     tower: PlaceTower,
-    files: Sequence[Path],
-    held_out: Sequence[Path],
+    scenes: Scenes,
     folder: Path,
     settings: PretrainSettings,
 ) -> Path:
@@ -214,17 +213,16 @@ def pretrain(
 
     Args:
         tower: with fresh weights.
-        files: scenes to learn from.
-        held_out: those that only measure.
+        scenes: to learn from.
         folder: of the run.
     """
     from safetensors.torch import save_file
 
     weights_file, draft = folder / "nano_tower.safetensors", folder / "draft.pt"
     if weights_file.is_file():
+        load_tower(tower, weights_file)
         return weights_file
     folder.mkdir(parents=True, exist_ok=True)
-    scenes = Scenes.load(sorted(files))
     weights, frequencies = scenes.weights()
     tower.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in the stubs
     optimizer = torch.optim.AdamW(tower.parameters(), lr=settings.lr, weight_decay=0.01)
@@ -257,14 +255,17 @@ def pretrain(
                     )
                 logger.info("update %d of %d, loss %.3f", done, settings.steps, loss.item())
             advance(1)
-    if held_out:
-        logger.info(
-            "Held-out scenes:\n%s", report(evaluate_tower(tower, Scenes.load(sorted(held_out))))
-        )
     state = {name: value.contiguous().half() for name, value in tower.state_dict().items()}
     with write_atomically(weights_file) as path:
         save_file(state, path)
     return weights_file
+
+
+def load_tower(tower: PlaceTower, file: Path) -> None:
+    """Give a tower the weights that `pretrain` wrote."""
+    from safetensors.torch import load_file
+
+    tower.load_state_dict({name: value.float() for name, value in load_file(file).items()})
 
 
 def _batch_loss(

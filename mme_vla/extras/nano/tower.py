@@ -55,8 +55,8 @@ NEARLY_ABSENT = 0.02
 division by zero.
 """
 IN_USE = 5 / 8
-"""The part of an image's height, from the top, that the network sees: nothing lies on the table
-below it.
+"""The part of an image's height, from the top, that the network sees: nothing lies on RoboMME's
+table below it.
 """
 NOTHING = -10.0  # logit of presence there
 COLUMNS, ROWS = (-0.7, 0.7), (-1.0, 0.1)
@@ -79,7 +79,8 @@ class TowerConfig:
 
     `blocks_…` are residual blocks. `pretrained` takes the weights that ship with the library.
     `layout` is that of the tokens: `places` (`PlaceTower`), or `segments` (`vision.ConvTower`) of
-    the shipped policy `checkpoint=nano`.
+    the shipped policy `checkpoint=nano`. `in_use` is the part of an image's height, from the top,
+    that `PlaceTower` sees.
     """
 
     image_size: int = 128
@@ -91,9 +92,14 @@ class TowerConfig:
     blocks_8: int = 2
     pretrained: bool = True
     layout: str = "segments"
+    in_use: float = IN_USE
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.vision.")
+        require(
+            0 < self.in_use <= 1,
+            f"backbone.vision.in_use={self.in_use} must be over 0 and at most 1.",
+        )
         check_choice("backbone.vision.layout", self.layout, ("places", "segments"))
         check_multiple("backbone.vision.", "image_size", self.image_size, "stride", 16)
         for name in ("width_32", "width_16", "width_8"):
@@ -158,10 +164,14 @@ class PlaceTower(nn.Module):
     Args:
         widths: channels of the three stages.
         blocks: residual blocks of each.
+        in_use: the part of an image's height, from the top, that the network sees.
     """
 
-    def __init__(self, widths: Sequence[int], blocks: Sequence[int]) -> None:
+    def __init__(
+        self, widths: Sequence[int], blocks: Sequence[int], in_use: float = IN_USE
+    ) -> None:
         super().__init__()
+        self.in_use = in_use
         self.stages = nn.ModuleList()
         for layers in build_stages(widths, blocks):
             self.stages.append(nn.Sequential(*layers))
@@ -184,7 +194,7 @@ class PlaceTower(nn.Module):
         """
         side = images.shape[-1]
         # whole tokens, and at least one row of them
-        x = images[..., : max(1, round(side * IN_USE / 16)) * 16, :]
+        x = images[..., : max(1, round(side * self.in_use / 16)) * 16, :]
         features = []
         for stage in self.stages:
             x = stage(x)

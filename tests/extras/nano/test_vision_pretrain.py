@@ -131,11 +131,9 @@ def test_one_report_between_two_objects_finds_one() -> None:
 def test_an_interrupted_training_ends_in_the_same_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, settings = (
-        save_scene(tmp_path / "a.npz"),
-        PretrainSettings(steps=4, batch_size=2, save_every=2),
-    )
-    full = pretrain(fresh_tower(TINY, 0), [file], [file], tmp_path / "full", settings).read_bytes()
+    scenes = Scenes.load([save_scene(tmp_path / "a.npz")])
+    settings = PretrainSettings(steps=4, batch_size=2, save_every=2)
+    full = pretrain(fresh_tower(TINY, 0), scenes, tmp_path / "full", settings).read_bytes()
     batch_loss = pretraining._batch_loss
 
     def interrupt(*args: Any) -> Tensor:
@@ -145,12 +143,10 @@ def test_an_interrupted_training_ends_in_the_same_weights(
 
     monkeypatch.setattr(pretraining, "_batch_loss", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        pretrain(fresh_tower(TINY, 0), [file], [file], tmp_path / "parts", settings)
+        pretrain(fresh_tower(TINY, 0), scenes, tmp_path / "parts", settings)
     monkeypatch.undo()
-    assert (
-        pretrain(fresh_tower(TINY, 0), [file], [file], tmp_path / "parts", settings).read_bytes()
-        == full
-    )
+    weights = pretrain(fresh_tower(TINY, 0), scenes, tmp_path / "parts", settings)
+    assert weights.read_bytes() == full
 
 
 def test_the_loss_leads_to_the_labels(tmp_path: Path) -> None:

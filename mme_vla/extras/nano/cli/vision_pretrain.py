@@ -18,7 +18,14 @@ from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import SceneError, UserError, require
 from mme_vla.evaluation.store import claim_run
-from mme_vla.extras.nano.pretraining import PretrainSettings, fresh_tower, pretrain
+from mme_vla.extras.nano.pretraining import (
+    PretrainSettings,
+    Scenes,
+    evaluate_tower,
+    fresh_tower,
+    pretrain,
+    report,
+)
 from mme_vla.extras.nano.tower import TowerConfig
 
 logger = logging.getLogger("mme_vla.nano")
@@ -81,7 +88,12 @@ def run(pretraining: PretrainRun) -> Path:
         seed=pretraining.seed,
         save_every=pretraining.save_every,
     )
-    return pretrain(fresh_tower(sizes, settings.seed), files, held_out, folder, settings)
+    tower = fresh_tower(sizes, settings.seed)
+    weights = pretrain(tower, Scenes.load(sorted(files)), folder, settings)
+    if held_out:
+        results = evaluate_tower(tower, Scenes.load(sorted(held_out)))
+        logger.info("Held-out scenes:\n%s", report(results))
+    return weights
 
 
 def _record(
