@@ -36,7 +36,7 @@ from mme_vla.extras.nano.rows import CHOICES, read_rows, table_of
 from mme_vla.utils import write_atomically
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from benchmarks.mikasa_tower import BACKBONE, ENV, make_tower, start  # noqa: E402
+from benchmarks.mikasa_tower import BACKBONE, ENV, make_tower, start
 
 MOST_STEPS = 180
 """Steps of an episode, of tasks whose own limit is longer: 87 to 120 demonstrate those of three
@@ -314,7 +314,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=2, help="trainings of each model")
     parser.add_argument("--demonstrations", type=int, default=40, help="of each task")
     parser.add_argument("--scenes", type=int, default=150, help="of each task for the vision tower")
-    parser.add_argument("--tower-steps", type=int, default=1300, help="updates of the vision tower")
+    parser.add_argument("--tower-steps", type=int, default=400, help="updates of the vision tower")
     parser.add_argument("--steps", type=int, default=1200, help="updates of a training")
     parser.add_argument("--episodes", type=int, default=10, help="test scenes of each task")
     parser.add_argument("--pairs", type=int, default=3, help="pairs of twins of each task")

@@ -140,7 +140,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--tasks", nargs="+", required=True)
     parser.add_argument("--scenes", type=int, default=150, help="of each task")
-    parser.add_argument("--steps", type=int, default=1300, help="updates")
+    parser.add_argument("--steps", type=int, default=400, help="updates")
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args(words)
     make_tower(args.tasks, args.output, args.scenes, args.steps, args.jobs)

@@ -25,7 +25,10 @@ def check_positive(config: Any, prefix: str) -> None:
     """Raise an error if a number of a dataclass is not a possible size."""
     for name, value in vars(config).items():
         if isinstance(value, float):
-            require(0 < value < 1, f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
+            require(
+                0 < value <= 1,
+                f"{prefix}{name}={brief(value)} must be more than 0 and at most 1.",
+            )
         if isinstance(value, int) and not isinstance(value, bool):
             most = DEEPEST if name in ("depth", "horizon") else LARGEST
             require(

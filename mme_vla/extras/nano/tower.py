@@ -96,10 +96,6 @@ class TowerConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.vision.")
-        require(
-            0 < self.in_use <= 1,
-            f"backbone.vision.in_use={self.in_use} must be over 0 and at most 1.",
-        )
         check_choice("backbone.vision.layout", self.layout, ("places", "segments"))
         check_multiple("backbone.vision.", "image_size", self.image_size, "stride", 16)
         for name in ("width_32", "width_16", "width_8"):

@@ -19,6 +19,7 @@ from benchmarks.mikasa_table import (
 )
 from helpers.rollout_fakes import save_records
 from mme_vla.config.composition import compose
+from mme_vla.envs.base import environment
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
@@ -29,9 +30,19 @@ CHOSEN = ["RememberColor3", "SeqOfColors3"]
 def arguments(output: Path, **more: object) -> Namespace:
     values = {
         "output": output, "tasks": CHOSEN, "models": ["framesamp_modul", "pi05"], "seeds": 2,
-        "demonstrations": 3, "steps": 5, "episodes": 2, "pairs": 1, "most_steps": 120, "jobs": 1,
+        "demonstrations": 3, "scenes": 2, "tower_steps": 1, "steps": 5, "episodes": 2, "pairs": 1,
+        "most_steps": MOST_STEPS, "jobs": 1,
     }  # fmt: skip
     return Namespace(**{**values, **more})
+
+
+@pytest.fixture(autouse=True)
+def no_tower(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Policies to start from are empty folders."""
+    monkeypatch.setattr(mikasa_table, "make_tower", lambda *args: None)
+    monkeypatch.setattr(
+        mikasa_table, "start", lambda tower, folder, seed: folder.mkdir(parents=True)
+    )
 
 
 class Commands:
@@ -87,8 +98,11 @@ class Commands:
 def test_every_row_is_made_once(tmp_path: Path) -> None:
     commands = Commands()
     rows = measure(arguments(tmp_path), commands)
+    assert [path.name for path in sorted((tmp_path / "tower").iterdir())] == [
+        "policy-0", "policy-1",
+    ]  # fmt: skip
     once = ["train", "evaluate", "evaluate", "probe"]
-    assert commands.done == ["record", *once, "analyse", *once, *once, *once]
+    assert commands.done == ["record", "record", *once, "analyse", *once, *once, *once]
     assert len(rows) == 8
     assert rows[1] == {
         "model": "framesamp_modul", "seed": "0", "task": "SeqOfColors3", "memory": "Capacity",
@@ -118,7 +132,7 @@ def test_the_ranking_is_compared_with_nanomme_and_the_paper() -> None:
     assert agreements([row for row in rows if row["model"] in order[:2]]) == []
 
 
-@pytest.mark.parametrize("stop", [1, 2, 3, 5, 7])
+@pytest.mark.parametrize("stop", [1, 2, 3, 4, 6, 8])
 def test_an_interrupted_run_goes_on(tmp_path: Path, stop: int) -> None:
     commands = Commands(stop)
     with pytest.raises(KeyboardInterrupt):
@@ -127,7 +141,7 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, stop: int) -> None:
     rows = measure(arguments(tmp_path), rest)
     assert len({(row["model"], row["seed"], row["task"]) for row in rows}) == len(rows) == 8
     done = commands.done + rest.done
-    assert (done.count("record"), done.count("train"), done.count("analyse")) == (1, 4, 1)
+    assert (done.count("record"), done.count("train"), done.count("analyse")) == (2, 4, 1)
 
 
 def test_a_row_that_is_missing_is_made_again(tmp_path: Path) -> None:
@@ -153,11 +167,13 @@ def test_the_choice_of_tasks_has_every_kind_of_memory_that_runs() -> None:
     assert len(set(TASKS)) == 24
     assert kinds == {family.memory for family in FAMILY_OF.values() if family.needs is None}
     longer = [task for task in TASKS if STEPS[task] > MOST_STEPS]
-    assert longer == ["BunchOfColors3", "SeqOfColors3", "ChainOfColors3"]
+    assert {FAMILY_OF[task].memory for task in longer} == {"Capacity", "Sequential"}
+    assert set(TASKS) <= set(environment(mikasa_table.ENV).tasks)
 
 
 def test_each_model_is_composed_with_its_settings() -> None:
     assert set(SELECTING) < set(MODELS)
     for model, words in MODELS.items():
-        cfg = compose("train", [f"model={model}", *words, *mikasa_table.TRAINING])
+        given = [*mikasa_table.BACKBONE, *words, *mikasa_table.TRAINING]
+        cfg = compose("train", [f"model={model}", f"env={mikasa_table.ENV}", *given])
         assert cfg.name == model
