@@ -59,23 +59,26 @@ SEEN = (
 )  # fmt: skip
 """Whose renders the vision tower learns from: they show every colour, shape and place."""
 ONE_TOKEN = ("memory.budget=16", "memory.grid=1")  # sixteen frames of one token each
+EVERY_FRAME = (*ONE_TOKEN, "memory.stride=1")
 MODELS: Mapping[str, Sequence[str]] = {
     "framesamp_modul": ONE_TOKEN,
-    "tokendrop_modul": (*ONE_TOKEN, "memory.stride=2"),
-    "ttt_modul": (*ONE_TOKEN, "memory.stride=2"),
-    "events_modul": (*ONE_TOKEN, "memory.stride=2"),
+    "tokendrop_modul": EVERY_FRAME,
+    "ttt_modul": EVERY_FRAME,
+    "events_modul": EVERY_FRAME,
     "actions_modul": ("memory.budget=16",),
-    "present_modul": ("memory.grid=4", "memory.positions=space"),
+    "present_modul": ("memory.grid=1", "memory.positions=space"),
     "pi05": (),
 }
-"""Model → the settings of its memory, of sixteen tokens."""
+"""Model → the settings of its memory, of sixteen tokens at most. All that read images read every
+frame, so that one vision cache serves them.
+"""
 SELECTING = ("framesamp_modul", "tokendrop_modul", "events_modul", "present_modul")
 """Models whose memory keeps frames, so that storage and update are defined."""
 TRAINING = (
-    "train.batch_size=32",
+    "train.batch_size=16",
     "train.lr=1e-3",
     "train.schedule=cosine",
-    "train.save_every=200",
+    "train.save_every=300",
     "train.val_samples=0",
     "train.open_loop_chunks=0",
     "data.cache.max_build_frames=1000000",
@@ -215,7 +218,7 @@ def _rows_of(
     if is_measured and not writing.is_file():
         run([
             "analyse", "writing", "--env", ENV, "--checkpoint", str(training), "--memories",
-            "--tasks", ",".join(args.tasks), "--episodes", str(args.episodes),
+            "--tasks", ",".join(args.tasks), "--episodes", str(args.demonstrated),
             "--output", str(writing),
         ])  # fmt: skip
 
@@ -315,9 +318,12 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--demonstrations", type=int, default=40, help="of each task")
     parser.add_argument("--scenes", type=int, default=150, help="of each task for the vision tower")
     parser.add_argument("--tower-steps", type=int, default=400, help="updates of the vision tower")
-    parser.add_argument("--steps", type=int, default=1200, help="updates of a training")
+    parser.add_argument("--steps", type=int, default=600, help="updates of a training")
     parser.add_argument("--episodes", type=int, default=10, help="test scenes of each task")
-    parser.add_argument("--pairs", type=int, default=3, help="pairs of twins of each task")
+    parser.add_argument("--pairs", type=int, default=2, help="pairs of twins of each task")
+    parser.add_argument(
+        "--demonstrated", type=int, default=2, help="of each task, whose stored facts are counted"
+    )
     parser.add_argument("--most-steps", type=int, default=MOST_STEPS, help="of an episode")
     parser.add_argument("--jobs", type=int, default=2, help="trainings or measurements at a time")
     print(summary(measure(parser.parse_args(words))))
