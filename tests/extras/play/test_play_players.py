@@ -228,11 +228,13 @@ def test_options_of_players_are_checked():
 # The oracle ---------------------------------------------------------------------------------------
 
 
-def test_the_oracle_needs_this_librarys_tasks():
+def test_the_oracle_is_this_librarys_or_the_environments_own(monkeypatch):
     session = a_session()
     session.start()
-    with pytest.raises(UserError, match="use it with env=mme_vla"):
+    with pytest.raises(UserError, match=r"Give it a method oracle\(\).*or use env=mme_vla"):
         OraclePlayer().choose(session)
+    monkeypatch.setattr(session.env, "oracle", lambda: {"choice": "b"}, raising=False)
+    assert OraclePlayer().choose(session) == ({"choice": "b"}, {})
 
 
 def test_the_oracle_solves_episodes_without_rendering(tmp_path, capsys):
