@@ -40,8 +40,8 @@ class MikasaScene(gymnasium.Env[Any, Any]):
     Attributes:
         scene: the task itself.
         time: steps since the reset.
-        frozen: first steps in which no action has an effect, by the protocol, or while a cue is
-            shown in any task (`by_choice`).
+        frozen: first steps in which no action has an effect, by the protocol. By choices, all but
+            the last of those before the answer can be given, of any task.
         cue_end: the first step at which the answer can be given.
         scene_facts: what its frames show.
         log: the facts of those so far.
@@ -74,7 +74,7 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         self._task = task
         self._is_twin = is_twin
         self._by_choice = by_choice
-        self._freezes = by_choice or (FAMILY_OF[task].frozen and not task.endswith("-Long"))
+        self._freezes = FAMILY_OF[task].frozen and not task.endswith("-Long")
         self.time = 0
 
     @contextmanager
@@ -113,7 +113,11 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         for name in ("cue_steps_per_env", "empty_steps_per_env"):
             if hasattr(self.scene, name):
                 self.cue_end += int(getattr(self.scene, name)[0])
-        self.frozen = self.cue_end if self._freezes else 0
+        self.frozen = 0
+        if self._by_choice:
+            self.frozen = max(self.cue_end - 1, 0)  # the decision is made before the answer is seen
+        elif self._freezes:
+            self.frozen = self.cue_end
         self.scene_facts = facts_of_task(self._task)(self.scene, self.cue_end, self._by_choice)
         if self._is_twin:
             self.scene_facts.flip()

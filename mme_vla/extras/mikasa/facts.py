@@ -12,6 +12,7 @@ import numpy as np
 
 from mme_vla.envs.facts import Candidates, VisibleFact
 from mme_vla.extras.mikasa.demonstrators import (
+    OPEN,
     TRAVEL,
     Actions,
     Hand,
@@ -37,7 +38,8 @@ class SceneFacts:
     Args:
         scene: has been reset; it is read at each frame.
         cue_end: the first step at which the answer can be given.
-        by_choice: whether each decision is about a whole movement, wherever the hand is.
+        by_choice: whether each decision is about a whole movement, wherever the hand is. The first
+            one is made while nothing is shown, so that nothing but memory can tell scenes apart.
     """
 
     has_twin: ClassVar[bool] = False
@@ -47,6 +49,7 @@ class SceneFacts:
         self._scene = scene
         self._cue_end = cue_end
         self._by_choice = by_choice
+        self._first_decision = max(cue_end - 1, 0) if by_choice else cue_end
 
     def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         """What the next frame shows, and whether a decision begins there that depends on the facts.
@@ -94,6 +97,13 @@ class Recall(SceneFacts):
         return things
 
     @property
+    def _planned_poses(self) -> Mapping[int, Any]:
+        """Key → where the object will appear [1, …], x and y first."""
+        scene = self._scene
+        planned: Mapping[int, Any] = getattr(scene, "_manip_raw_poses", None) or scene.initial_poses
+        return planned
+
+    @property
     def _right(self) -> Any:
         """The tensor that holds the key, or keys, of what is right [1, …]."""
         for name in ("true_color_indices", "true_shape_indices", "imposter_key"):
@@ -135,7 +145,7 @@ class Recall(SceneFacts):
         visible = {}
         for number, key in enumerate(self._shown(time), 1):
             visible[f"object {number}"] = VisibleFact(self._name(key))
-        return visible, time == self._cue_end
+        return visible, time == self._first_decision
 
     def flip(self) -> None:
         """The next object is the right one."""
@@ -145,9 +155,9 @@ class Recall(SceneFacts):
             scene._apply_phase_layout(scene.elapsed_steps.long())
 
     def candidates(self, time: int) -> Candidates | None:
-        if time < self._cue_end:
+        if time < self._first_decision:
             return None
-        return self._among(list(self._things), self._answers[0])
+        return self._among(list(self._things), self._answers[0], time)
 
     def things(self) -> Mapping[str, Any]:
         return {self._described(key): thing for key, thing in self._things.items()}
@@ -156,15 +166,27 @@ class Recall(SceneFacts):
         hand = Hand(self._scene)
         choices = {}
         for name, thing in self.things().items():
-            choices[f"touch the {name}"] = touch_thing(hand, partial(_offset, hand, thing))
+            touch = touch_thing(hand, partial(_offset, hand, thing))
+            choices[f"touch the {name}"] = self._after_cue(hand, touch)
         return choices
 
     def right_choice(self) -> int:
         return list(self._things).index(self._answers[0])
 
-    def _among(self, keys: Sequence[int], right: int) -> Candidates:
+    def _after_cue(self, hand: Hand, script: Actions) -> Actions:
+        """The actions of a script, once the objects are there."""
+        while int(self._scene.elapsed_steps[0]) < self._cue_end:
+            yield hand.action(gripper=OPEN)
+        yield from script
+
+    def _among(self, keys: Sequence[int], right: int, time: int) -> Candidates:
         """These objects, of which one is right."""
-        places = [place_of(self._things[key])[:2].tolist() for key in keys]
+        places = []
+        for key in keys:
+            place = place_of(self._things[key])
+            if time < self._cue_end:  # where it will appear
+                place = self._planned_poses[key][0].cpu().numpy()
+            places.append(place[:2].tolist())
         return Candidates(places, [keys.index(right)])
 
 
@@ -204,14 +226,14 @@ class Several(Recall):
             if new or np.linalg.norm(gap) < _NEAR:
                 fact = VisibleFact(self._name(last), {"touches"}, replaces=self._in_order)
                 visible[f"touch {len(self._touched)}"] = fact
-        return visible, time == self._cue_end or bool(new)
+        return visible, time == self._first_decision or bool(new)
 
     def _is_free(self, time: int) -> bool:
         """Whether the hand can go to any cube next, after the cue: of motions where it is at the
         height at which it passes over cubes.
         """
         if self._by_choice:
-            return time >= self._cue_end
+            return time >= self._first_decision
         height = float(place_of(self._scene.agent.tcp)[2])
         return time >= self._cue_end and abs(height - TRAVEL) < 0.03
 
@@ -224,14 +246,15 @@ class Several(Recall):
         *former, last = self._answers
         if not self._is_free(time) or set(former) - set(self._touched):
             return None
-        return self._among([key for key in self._things if key not in former], last)
+        return self._among([key for key in self._things if key not in former], last, time)
 
     def choices(self) -> Mapping[str, Actions]:
         hand = Hand(self._scene)
         choices = {}
         for key in self._things:
-            choices[f"touch the {self._described(key)}"] = touch_cube(hand, key)
-        choices["press the button"] = press_button(hand)
+            touch = touch_cube(hand, key)
+            choices[f"touch the {self._described(key)}"] = self._after_cue(hand, touch)
+        choices["press the button"] = self._after_cue(hand, press_button(hand))
         return choices
 
     def right_choice(self) -> int:

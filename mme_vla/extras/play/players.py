@@ -115,8 +115,8 @@ class OraclePlayer(Player):
                 known = session.env.oracle()
             if known is None:
                 raise UserError(
-                    "player=oracle: this environment has no oracle. Give it a method oracle(), which"
-                    ' returns {"choice": letter}, or use env=mme_vla.'
+                    "player=oracle: this environment has no oracle. Give it a method oracle(),"
+                    ' which returns {"choice": letter}, or use env=mme_vla.'
                 )
             return dict(known), {}
         try:
