@@ -78,7 +78,7 @@ TRAINING = (
     "train.batch_size=16",
     "train.lr=1e-3",
     "train.schedule=cosine",
-    "train.save_every=300",
+    "train.save_every=200",
     "train.val_samples=0",
     "train.open_loop_chunks=0",
     "data.cache.max_build_frames=1000000",
@@ -318,7 +318,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--demonstrations", type=int, default=40, help="of each task")
     parser.add_argument("--scenes", type=int, default=150, help="of each task for the vision tower")
     parser.add_argument("--tower-steps", type=int, default=400, help="updates of the vision tower")
-    parser.add_argument("--steps", type=int, default=600, help="updates of a training")
+    parser.add_argument("--steps", type=int, default=400, help="updates of a training")
     parser.add_argument("--episodes", type=int, default=10, help="test scenes of each task")
     parser.add_argument("--pairs", type=int, default=2, help="pairs of twins of each task")
     parser.add_argument(
