@@ -22,7 +22,7 @@ from mme_vla.envs.rendering import keep_renderer, lean_shaders, links_culled, re
 from mme_vla.errors import check_known, require
 from mme_vla.extras.mikasa.assets import check_assets, check_package, is_there
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS, by_horizon, by_memory
-from mme_vla.extras.mikasa.demonstrators import demonstrate, place_of
+from mme_vla.extras.mikasa.demonstrators import demonstrate, place_of, wrapped
 from mme_vla.extras.mikasa.facts import facts_of_task
 from mme_vla.registry import ENVS
 
@@ -35,7 +35,8 @@ _SIDE = 128  # of images
 class MikasaScene(gymnasium.Env[Any, Any]):
     """A task with observations by the protocol: two images, and position [3], roll, pitch and yaw
     of the hand and the opening of the gripper. Actions are changes of the hand's pose in [−1, 1]:
-    0.1 m and 0.1 rad at 1, and the gripper (1 opens it).
+    0.1 m and 0.1 rad at 1, and the gripper (1 opens it). By choices the pose is relative to the
+    first one.
 
     Attributes:
         scene: the task itself.
@@ -150,10 +151,16 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         """The state [7], and for each camera the function that takes its image [128, 128, 3]."""
         from transforms3d.euler import quat2euler
 
-        pose = self.scene.agent.tcp.pose.raw_pose[0].cpu().numpy()
+        tool = self.scene.agent.tcp.pose.raw_pose[0].cpu().numpy().astype(np.float64)
         opening = self.scene.agent.robot.get_qpos()[0, -2:].sum().cpu().numpy()
-        angles = quat2euler(pose[3:].astype(np.float64))
-        state = np.concatenate([pose[:3], angles, [opening]]).astype(np.float32)
+        pose = np.concatenate([tool[:3], quat2euler(tool[3:])])
+        if self._by_choice:
+            # All tasks share their seeds, and the first pose would tell which seed it is.
+            if self.time == 0:
+                self._first_pose = pose
+            pose = pose - self._first_pose
+            pose[3:] = [wrapped(angle) for angle in pose[3:]]
+        state = np.append(pose, opening).astype(np.float32)
         self._is_current = False  # the renderer's copy of the scene
         images: dict[str, Callable[[], np.ndarray]] = {}
         for name, camera in CAMERAS.items():
