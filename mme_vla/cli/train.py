@@ -124,7 +124,7 @@ def train(
         SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the
             signal's number.
     """
-    check_logger(run.config)
+    check_logger(run.logger)
     if run.train.device == "cuda":
         find_device("cuda")  # says so where there is none
     # Where processes have all weights each, gradients lie in what is sent instead of being copied
@@ -201,7 +201,7 @@ def _train(
     line.say(trainer.describe())
     loggers = Loggers()
     if first:
-        loggers = open_loggers(place.folder, saved_config, place.step)
+        loggers = open_loggers(place.folder, saved_config, place.step, run.logger)
         remove_drafts(place.folder)
         with write_atomically(place.folder / CONFIG) as draft:
             OmegaConf.save(OmegaConf.create(config), draft)

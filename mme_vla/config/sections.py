@@ -70,6 +70,16 @@ PathText = Annotated[str, BeforeValidator(_number_as_text)]
 """A path or a name. A command line reads a folder called `7` as a number."""
 
 
+def _none_if_empty(value: Any) -> Any:
+    return value or None
+
+
+Secret = Annotated[PathText | None, BeforeValidator(_none_if_empty)]
+"""A key that a server asks for. An empty environment variable, as compose files leave it, is no
+key.
+"""
+
+
 def read_section[T](
     kind: type[T], values: Any, where: str = "", *, others: bool = False, **fixed: Any
 ) -> T:

@@ -72,6 +72,17 @@ class Trained:
 
 
 @dataclass(frozen=True)
+class _Limits:
+    """Settings of `run.json` that are rules of the board: of an evaluation `max_actions`, of a run
+    of `play` `max_choices`.
+    """
+
+    max_actions: int | None = None
+    max_choices: int | None = None
+    only_possible: bool = False
+
+
+@dataclass(frozen=True)
 class Training:
     """One training and its episodes, numbered from 0 within each task.
 
@@ -201,10 +212,10 @@ def read_training(folder: Path) -> Training:
     counts = Counter(record.key for record in records)
     twice = [f"{key.task} {key.episode}" for key, count in counts.items() if count > 1]
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
-    settings = run["settings"]
-    max_choices = settings.get("max_actions", settings.get("max_choices"))
-    only_possible = settings.get("only_possible", False)
-    rules = rules_text(records[0].action_space, max_choices, only_possible)
+    where = f"{folder / RUN_FILE}: settings"
+    limits = read_section(_Limits, run["settings"], where, others=True)
+    max_choices = limits.max_choices if limits.max_actions is None else limits.max_actions
+    rules = rules_text(records[0].action_space, max_choices, limits.only_possible)
     return Training(folder, facts, _numbered(folder, records), rules)
 
 

@@ -127,7 +127,7 @@ def _choose_player(
         )
         from mme_vla.extras.play.policy_player import load_player  # PyTorch
 
-        player, facts, decisive = load_player(cfg, settings.max_steps)
+        player, facts, decisive = load_player(cfg, settings.max_steps, settings.max_choices)
         model, checkpoint, seed = player.model, facts.checkpoint, command.seed
         folder = Path("outputs", "play", model, str(checkpoint))
         for name in ("memory_budget", "composition", "training"):

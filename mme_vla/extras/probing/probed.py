@@ -320,7 +320,10 @@ class ProbedPolicy(Policy):
         self.sessions = list(sessions)[: self.feed.n_sessions]
         self.n_before = sum(recording.length for recording in self.sessions)
         """Frames of the sessions."""
-        self.memory, self.processor, self.config = inner.memory, inner.processor, dict(inner.config)
+        self.memory = inner.memory
+        self.processor = inner.processor
+        arm_config = {"probe": [arm.name, options_of(arm)]} if arm.parts else {}
+        self.config = {**inner.config, **arm_config}
         self.horizon = inner.horizon
         # Episodes of a stress split's sessions count (`with_sessions`), those of an arm do not.
         self.info = PolicyInfo(
@@ -331,8 +334,6 @@ class ProbedPolicy(Policy):
             server=inner.info.server,
             history_dtype=inner.info.history_dtype,
         )
-        if arm.parts:
-            self.config["probe"] = [arm.name, options_of(arm)]
 
     def start_episode(self, goal: str, seed: int = 0) -> ProbedEpisode:
         return ProbedEpisode(self, goal, seed)

@@ -114,9 +114,7 @@ class ProbeChoice:
         if self.recordings is None:
             return
         for entry in listed_sources(self.recordings):
-            root = entry if isinstance(entry, str) else entry.get("root")
-            if isinstance(root, str) and root:
-                resolve_root(root)
+            resolve_root(entry.root)
 
     def _check_twins(self) -> None:
         """Refuse what has no effect on twins."""
