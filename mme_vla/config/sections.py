@@ -70,11 +70,7 @@ PathText = Annotated[str, BeforeValidator(_number_as_text)]
 """A path or a name. A command line reads a folder called `7` as a number."""
 
 
-def _none_if_empty(value: Any) -> Any:
-    return value or None
-
-
-Secret = Annotated[PathText | None, BeforeValidator(_none_if_empty)]
+Secret = Annotated[PathText | None, BeforeValidator(lambda value: value or None)]
 """A key that a server asks for. An empty environment variable, as compose files leave it, is no
 key.
 """

@@ -345,18 +345,6 @@ class OnlineHistory(History):
             self._stored_frames.extend((offsets + self._length).tolist())
         self._length += count
 
-    def _add_score(self, frame: int, values: np.ndarray) -> None:
-        row = self._n_scores
-        if row == len(self._scores.frames):
-            more = max(row, 16)
-            self._scores = FrameScores(
-                np.concatenate([self._scores.frames, np.zeros(more, np.int64)]),
-                np.concatenate([self._scores.values, np.zeros((more, len(values)), np.float32)]),
-            )
-        self._scores.frames[row] = frame
-        self._scores.values[row] = values
-        self._n_scores += 1
-
     def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches,
         d_vision].
@@ -375,8 +363,20 @@ class OnlineHistory(History):
             return
         for frame, image in zip((offsets + self._length).tolist(), frames, strict=True):
             values = self._scorer(frame, image)
-            if values is not None:
-                self._add_score(frame, values)
+            if values is None:
+                continue
+            # The arrays double where they are full.
+            row = self._n_scores
+            if row == len(self._scores.frames):
+                more = max(row, 16)
+                empty = np.zeros((more, len(values)), np.float32)
+                self._scores = FrameScores(
+                    np.concatenate([self._scores.frames, np.zeros(more, np.int64)]),
+                    np.concatenate([self._scores.values, empty]),
+                )
+            self._scores.frames[row] = frame
+            self._scores.values[row] = values
+            self._n_scores += 1
 
     def _grow(self, needed: int, like: Tensor) -> None:
         capacity = 0 if self._tokens is None else len(self._tokens)

@@ -114,20 +114,16 @@ class RMTLayer(RecurrentLayer):
         self, x: Tensor, weight: Tensor, rope: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Project x [..., n, hidden] to heads [..., n, heads, h], and rotate all but the values,
-        which are last.
+        which are last: their pairs (2i, 2i + 1), by angles with cosines and sines [n, 1, h/2].
         """
         heads = nn.functional.linear(x, weight).unflatten(-1, (-1, self.head_dim))
         qk, v = heads.tensor_split([-self.kv_heads], -2)
-        return self._rotate(qk, *rope), v
-
-    def _rotate(self, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-        """Rotate the pairs (2i, 2i + 1) of [..., n, heads, h] by angles with cosines and sines [n,
-        1, h/2].
-        """
-        a, b = x[..., 0::2], x[..., 1::2]
+        cos, sin = rope
+        a, b = qk[..., 0::2], qk[..., 1::2]
+        rotated = [a * cos - b * sin, a * sin + b * cos]
         if self.rotation == "cosine_only":
-            return torch.stack([a * cos, b * cos], -1).flatten(-2)
-        return torch.stack([a * cos - b * sin, a * sin + b * cos], -1).flatten(-2)
+            rotated = [a * cos, b * cos]
+        return torch.stack(rotated, -1).flatten(-2), v
 
     def _attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Every slot attends to every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n,

@@ -106,7 +106,12 @@ def run_audit(
     references = dict(references or {})
     notes = []
     if RANDOM not in references:
-        why = _no_floor(policy, recordings)
+        # What the random floor needs and lacks.
+        why = None
+        if policy.embodiment.readings:
+            why = NEEDS["stream"]
+        elif not policy.embodiment.action.choice and not recordings:
+            why = NEEDS["recordings"]
         if why is None:
             _run_floor(policy, plan, folder / RANDOM, facts, settings, options)
             references[RANDOM] = str(folder / RANDOM)
@@ -117,16 +122,6 @@ def run_audit(
     conclusion = conclude(card, audit.resolve)
     _write(card, conclusion, folder, policy)
     return Audit(card, conclusion, folder / PAGE)
-
-
-def _no_floor(policy: Policy, recordings: Sequence[Recording]) -> str | None:
-    """What the random floor needs and lacks, for a message; None where it can be measured."""
-    robot = policy.embodiment
-    if robot.readings:
-        return NEEDS["stream"]
-    if not robot.action.choice and not recordings:
-        return NEEDS["recordings"]
-    return None
 
 
 def _run_floor(

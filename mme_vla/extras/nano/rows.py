@@ -144,8 +144,22 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
         if training.is_local and name in names:
             name = f"{name} (yours)"
         row = rows.setdefault(name, [])
+        # Trainings of a row are of one recipe, and none is another one. Their digests of the data
+        # may differ: demonstrations recorded on another processor end otherwise here and there.
         for earlier in row:
-            _check_alike(earlier, training)
+            both = f"{earlier.folder} and {training.folder}"
+            first, second = earlier.facts, training.facts
+            for fact in ("kind", "recipe", "demonstrations", "budget"):
+                values = getattr(first, fact), getattr(second, fact)
+                require(
+                    values[0] == values[1],
+                    f"{both} are trainings of the row {first.row}, but {fact} is {values[0]} and"
+                    f" {values[1]}. Give them different names of rows.",
+                )
+            require(
+                first.seed != second.seed and first.weights != second.weights,
+                f"{both} have the same seed or weights: they are one training.",
+            )
         row.append(training)
         require(
             training.rules == trainings[0].rules,
@@ -299,23 +313,3 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
         f" lacks {listed(missing) or 'none'}, and has {listed(others) or 'none'} beside them.",
     )
     return numbered
-
-
-def _check_alike(first: Training, other: Training) -> None:
-    """Make sure that two trainings of a row are of one recipe, and not the same one.
-
-    Their digests of the data may differ: demonstrations recorded on another processor end otherwise
-    here and there.
-    """
-    for name in ("kind", "recipe", "demonstrations", "budget"):
-        value = getattr(first.facts, name)
-        other_value = getattr(other.facts, name)
-        require(
-            value == other_value,
-            f"{first.folder} and {other.folder} are trainings of the row {first.facts.row}, but"
-            f" {name} is {value} and {other_value}. Give them different names of rows.",
-        )
-    require(
-        first.facts.seed != other.facts.seed and first.facts.weights != other.facts.weights,
-        f"{first.folder} and {other.folder} have the same seed or weights: they are one training.",
-    )

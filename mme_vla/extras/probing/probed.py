@@ -527,7 +527,11 @@ def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
     count = 0 if variant is None else variant.sessions
     if not count:
         return policy
-    episodes = _recorded_episodes(policy, recordings)
+    episodes: list[Recording] = []
+    if isinstance(recordings, Sequence) and all(isinstance(one, Recording) for one in recordings):
+        episodes = list(recordings)
+    elif recordings is not None:
+        episodes = all_recordings(open_sources(recordings, policy.embodiment))
     if policy.embodiment.readings or count > len(episodes):
         raise UserError(
             f"split={split} needs {count} recorded episodes to take from, and there are"
@@ -537,12 +541,3 @@ def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
     probed.info = replace(probed.info, n_distractor_episodes=count)
     probed.config["sessions"] = [recording.name for recording in probed.sessions]
     return probed
-
-
-def _recorded_episodes(policy: Policy, recordings: Any) -> list[Recording]:
-    """The recorded episodes of datasets; recorded episodes as they are, and none for None."""
-    if recordings is None:
-        return []
-    if isinstance(recordings, Sequence) and all(isinstance(one, Recording) for one in recordings):
-        return list(recordings)
-    return all_recordings(open_sources(recordings, policy.embodiment))

@@ -15,7 +15,6 @@ from mme_vla.extras.methods.sam2act.geometry import (
     Cube,
     PointFinder,
     angles_of_bins,
-    zoom_back,
 )
 from mme_vla.extras.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.extras.methods.sam2act.processor import (
@@ -81,7 +80,7 @@ def decide(
     bins = torch.stack([outputs[axis].argmax(-1) for axis in "xyz"], -1)
     angles = torch.deg2rad(angles_of_bins(bins, network.sizes.rotation_bins)).float()
     grip = 2.0 * outputs["gripper"].argmax(-1, keepdim=True) - 1
-    position = cube.back(zoom_back(point, first, ZOOM))
+    position = cube.back(point / ZOOM + first)  # in the coordinates of the first look
     waypoint = torch.cat([position, angles, grip], -1)[0].float()
     return waypoint, remembered
 
