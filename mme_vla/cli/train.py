@@ -89,7 +89,8 @@ def train_several(run: TrainRun, folder: Path) -> list[Path]:
     checkpoints = []
     for number in range(run.trainings):
         place = folder / training_name(number)
-        one = run.with_keys(seed=run.seed + number, output=str(place), resume="auto")
+        own = {"seed": run.seed + number, "output": str(place), "resume": "auto"}
+        one = TrainRun.from_config({**run.config, **own})
         existing = open_run(place, "auto", one.config)
         is_finished = (place / SUMMARY).is_file() and existing.step == one.train.steps
         if is_finished and existing.checkpoint is not None:

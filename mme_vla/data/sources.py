@@ -140,6 +140,9 @@ def open_sources(
     exec_starts.
 
     `robot` says which columns hold its images, states and actions.
+
+    Raises:
+        UserError: two have one name, or the same names of numbers in another order.
     """
     sources = []
     for entry in listed_sources(entries):
@@ -150,8 +153,33 @@ def open_sources(
             f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its"
             " own."
         )
-    for other in sources[1:]:
-        compare_sources(sources[0], other)
+    # They are trained on together. Other rates and other sizes of numbers (degrees beside radians)
+    # are a warning: both may be meant.
+    first = sources[0]
+    for second in sources[1:]:
+        for kind, first_names, second_names in (
+            ("state", first.state_names, second.state_names),
+            ("action", first.action_names, second.action_names),
+        ):
+            compare_names(
+                first_names,
+                second_names,
+                kind,
+                f"the source {first.name}",
+                f"the source {second.name}",
+                "Trained together, one number would mean two things: bring one dataset's columns"
+                " into the other's order.",
+            )
+            _compare_scales(first, second, kind)
+        if first.fps != second.fps:
+            log.warning(
+                "The source %s has %g frames per second, %s has %g: one step of a chunk is another"
+                " time in each.",
+                first.name,
+                first.fps,
+                second.name,
+                second.fps,
+            )
     return sources
 
 
@@ -159,40 +187,6 @@ UNITS_APART = 20
 """How many times larger one source's numbers are than the other's where units differ: 57 from
 radians to degrees.
 """
-
-
-def compare_sources(first: EpisodeSource, second: EpisodeSource) -> None:
-    """Compare two datasets that are trained on together.
-
-    Other rates and other sizes of numbers (degrees beside radians) are a warning: both may be
-    meant.
-
-    Raises:
-        UserError: their numbers have the same names in another order.
-    """
-    for kind, first_names, second_names in (
-        ("state", first.state_names, second.state_names),
-        ("action", first.action_names, second.action_names),
-    ):
-        compare_names(
-            first_names,
-            second_names,
-            kind,
-            f"the source {first.name}",
-            f"the source {second.name}",
-            "Trained together, one number would mean two things: bring one dataset's columns into"
-            " the other's order.",
-        )
-        _compare_scales(first, second, kind)
-    if first.fps != second.fps:
-        log.warning(
-            "The source %s has %g frames per second, %s has %g: one step of a chunk is another time"
-            " in each.",
-            first.name,
-            first.fps,
-            second.name,
-            second.fps,
-        )
 
 
 def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> None:

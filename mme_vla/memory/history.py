@@ -339,7 +339,12 @@ class OnlineHistory(History):
         if len(tokens):
             start = len(self._stored_frames)
             stop = start + len(tokens)
-            self._grow(stop, tokens)
+            capacity = 0 if self._tokens is None else len(self._tokens)
+            if stop > capacity:
+                larger = tokens.new_empty((max(stop, 2 * capacity, 16), *tokens.shape[1:]))
+                if self._tokens is not None:
+                    larger[:start] = self._tokens[:start]
+                self._tokens = larger
             assert self._tokens is not None
             self._tokens[start:stop] = tokens
             self._stored_frames.extend((offsets + self._length).tolist())
@@ -377,16 +382,6 @@ class OnlineHistory(History):
             self._scores.frames[row] = frame
             self._scores.values[row] = values
             self._n_scores += 1
-
-    def _grow(self, needed: int, like: Tensor) -> None:
-        capacity = 0 if self._tokens is None else len(self._tokens)
-        if needed <= capacity:
-            return
-        larger = like.new_empty((max(needed, 2 * capacity, 16), *like.shape[1:]))
-        if self._tokens is not None:
-            used = len(self._stored_frames)
-            larger[:used] = self._tokens[:used]
-        self._tokens = larger
 
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:

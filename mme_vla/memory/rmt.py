@@ -133,27 +133,22 @@ class RMTLayer(RecurrentLayer):
         # Without a mask, the queries that share a key head are simply more queries of that head.
         q = q.unflatten(2, (self.kv_heads, -1)).permute(0, 2, 3, 1, 4).flatten(2, 3)  # b kv (g n) h
         k, v = k.transpose(1, 2), v.transpose(1, 2)
-        if self.attention_dtype == torch.float32:
+        dtype = self.attention_dtype
+        if dtype == torch.float32:
             mixed = nn.functional.scaled_dot_product_attention(q, k, v)
         else:
-            mixed = attend_rounded(q, k, v, self.attention_dtype)
+            # Round where the released code does: inputs, weights and result to `dtype`; softmax in
+            # float32. Fused kernels round the weights before they are normalised, which moves a
+            # slot by up to 2 % over a window.
+            q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
+            scores = (q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)
+            weights = scores.softmax(-1).to(dtype)
+            if q.device.type == "cpu":
+                # Sums are float32 either way, and many CPUs only emulate products of bfloat16.
+                mixed = (weights.float() @ v.float()).to(dtype).float()
+            else:
+                mixed = (weights @ v).float()
         return mixed.view(b, heads, n, h).transpose(1, 2).flatten(2)
-
-
-def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
-    """Attention that rounds where the released code does: inputs, weights and result to `dtype`;
-    softmax in float32.
-
-    Fused kernels round the weights before they are normalised, which moves a slot by up to 2 % over
-    a window.
-    """
-    q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
-    scores = (q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)
-    weights = scores.softmax(-1).to(dtype)
-    if q.device.type == "cpu":
-        # Sums are float32 either way, and many CPUs only emulate products of bfloat16.
-        return (weights.float() @ v.float()).to(dtype).float()
-    return (weights @ v).float()
 
 
 @torch.no_grad()

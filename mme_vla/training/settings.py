@@ -242,7 +242,3 @@ class TrainRun:
         run = read_section(cls, config, others=True, train=settings, config={})
         check_budget(run.memory)
         return replace(run, config=config)
-
-    def with_keys(self, **changes: Any) -> Self:
-        """The same training with other values of keys of the top level."""
-        return self.from_config({**self.config, **changes})

@@ -173,8 +173,11 @@ def _match_local(
     _check_tokenizer(policy, checkpoint.folder)
     state = policy.state_dict()
     left = []
+    components = policy.finetune_spec.components.items()
     for name in sorted(set(tensors) - set(state)):
-        if _OF_MEMORY.search(name) or _part(policy, name) == "memory":
+        # The component that another's parameter would belong to, if any.
+        component = next((part for part, pattern in components if re.match(pattern, name)), None)
+        if _OF_MEMORY.search(name) or component == "memory":
             left.append(name)
             del tensors[name]
     shapes = {name: tuple(tensor.shape) for name, tensor in state.items()}
@@ -220,16 +223,6 @@ def _match_foreign(
     tensors = checkpoint.tensors(check_names)
     reduced, named, left = split(tensors)
     return reduced.translate(named, state, source), left
-
-
-def _part(policy: Policy, name: str) -> str | None:
-    """The part of a policy that another's parameter would belong to; None where it has
-    none such.
-    """
-    for part, pattern in policy.finetune_spec.components.items():
-        if re.match(pattern, name):
-            return part
-    return None
 
 
 def _check_tokenizer(policy: Policy, folder: Path) -> None:

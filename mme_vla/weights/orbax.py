@@ -205,7 +205,14 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
     arrays: dict[str, np.ndarray] = {}
     for name, tensor in sorted(tree.items()):
         path = ("params", *name.split("/"), "value")
-        arrays[".".join(path)] = _to_numpy(tensor)
+        values = tensor.detach().cpu().contiguous()
+        if values.dtype == torch.bfloat16:
+            import ml_dtypes  # comes with tensorstore
+
+            array = values.view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
+        else:
+            array = values.numpy()
+        arrays[".".join(path)] = array
         leaves[str(path)] = {
             "key_metadata": [{"key": key, "key_type": _DICT_KEY} for key in path],
             "value_metadata": {"value_type": "np.ndarray", "skip_deserialize": False},
@@ -275,15 +282,6 @@ def _store(params: Path | Zipped, path: str, ocdbt: bool) -> dict[str, Any]:
     if ocdbt:
         return {"driver": "ocdbt", "base": f"file://{place}/", "path": within}
     return {"driver": "file", "path": f"{place}/{path}/"}
-
-
-def _to_numpy(tensor: Tensor) -> np.ndarray:
-    tensor = tensor.detach().cpu().contiguous()
-    if tensor.dtype == torch.bfloat16:
-        import ml_dtypes  # comes with tensorstore
-
-        return tensor.view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
-    return tensor.numpy()
 
 
 def _tensorstore() -> Any:

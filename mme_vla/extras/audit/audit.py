@@ -19,7 +19,7 @@ from mme_vla.extras.audit.conclusion import (
     INTERVENTIONS,
     Conclusion,
     conclude,
-    scenes_for,
+    resolution,
 )
 from mme_vla.extras.audit.floor import RANDOM, RandomPolicy
 from mme_vla.extras.probing.arms import UNPROBED, slug
@@ -143,7 +143,10 @@ def _run_floor(
 
 def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:
     """How many scenes of each task the stated difference needs."""
-    return math.ceil(scenes_for(audit.resolve) / max(n_tasks, 1))
+    scenes = 4
+    while resolution(scenes) > audit.resolve and scenes < 512:
+        scenes += 1
+    return math.ceil(scenes / max(n_tasks, 1))
 
 
 def _affordable_scenes(

@@ -80,14 +80,6 @@ def resolution(scenes: int) -> float:
     return float("inf")
 
 
-def scenes_for(loss: float) -> int:
-    """How many scenes it takes to tell such a loss from none."""
-    scenes = 4
-    while resolution(scenes) > loss and scenes < 512:
-        scenes += 1
-    return scenes
-
-
 def conclude(card: Card, target_loss: float) -> Conclusion:
     """The conclusion of a card whose interventions are `INTERVENTIONS`.
 

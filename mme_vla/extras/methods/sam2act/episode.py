@@ -159,7 +159,14 @@ class KeyframeEpisode(Episode):
             if demo[at]:
                 self._video.append((processor.shots(frames, i), float(fingers[at])))
         if len(demo) and not demo[-1]:
-            self._store_video()
+            # The video is over: some of its moments, spread evenly, are remembered.
+            count = min(len(self._video), processor.video_frames)
+            indices = np.linspace(0, len(self._video) - 1, count).round().astype(int)
+            for place, index in enumerate(indices):
+                shots, finger = self._video[index]
+                scene = self._scene_inputs(shots, finger, place)
+                self.remembered = self._policy.watch(scene, self.remembered)
+            self._video = []
             if self._after is not None:
                 self.remembered, self._after = self._after, None
                 self.waypoints += 1
@@ -206,16 +213,6 @@ class KeyframeEpisode(Episode):
         assert isinstance(twin, KeyframeEpisode) and twin.awaiting is not None
         newest = twin.awaiting.maps[-1]  # the others are not what this episode saw
         self.decided(BankState((*self.remembered.maps, newest)[-self._policy.most_remembered :]))
-
-    def _store_video(self) -> None:
-        most = self._policy.require_processor().video_frames
-        count = min(len(self._video), most)
-        indices = np.linspace(0, len(self._video) - 1, count).round().astype(int)
-        for place, index in enumerate(indices):
-            shots, finger = self._video[index]
-            scene = self._scene_inputs(shots, finger, place)
-            self.remembered = self._policy.watch(scene, self.remembered)
-        self._video = []
 
     def _scene_inputs(self, shots: list[Shot], finger: float, place: int) -> SceneInputs:
         processor = self._policy.require_processor()
