@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
@@ -18,14 +18,16 @@ from mme_vla.extras.methods.sam2act.geometry import (
 )
 from mme_vla.extras.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.extras.methods.sam2act.processor import (
-    SAM2ActProcessor,
     Shot,
     cloud_images,
     zoomed_images,
 )
 from mme_vla.extras.methods.sam2act.sam2 import BankState
 from mme_vla.extras.methods.writable_memory import MemoryEntries
-from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.episode import Episode
+
+if TYPE_CHECKING:
+    from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
 
 
 @dataclass(frozen=True)
@@ -97,17 +99,6 @@ def watch(
     return network.coarse_step(views, remembered)[1]
 
 
-class Watcher(Host, Protocol):
-    """What this episode asks of its policy besides."""
-
-    @property
-    def most_remembered(self) -> int: ...
-
-    def require_processor(self) -> SAM2ActProcessor: ...
-
-    def watch(self, scene: SceneInputs, remembered: BankState) -> BankState: ...
-
-
 class KeyframeEpisode(Episode):
     """Goal, bank and current shots of one episode.
 
@@ -116,9 +107,9 @@ class KeyframeEpisode(Episode):
     first execution frame is there.
     """
 
-    _policy: Watcher
+    _policy: "SAM2ActPolicy"
 
-    def __init__(self, policy: Watcher, goal: str, seed: int = 0) -> None:
+    def __init__(self, policy: "SAM2ActPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self.remembered = BankState()
         """What was kept of all keyframes before the current one."""
