@@ -170,7 +170,16 @@ def _match_local(
     it has not.
     """
     tensors = merge_state(checkpoint.tensors(), PolicySections.of(checkpoint.config).adapters)
-    _check_tokenizer(policy, checkpoint.folder)
+    # Token ids may mean other words.
+    if policy.processor is not None and (checkpoint.folder / CONFIG_FILE).is_file():
+        prompt = policy.processor.prompt_spec
+        fingerprint = read_settings(checkpoint.folder).get("tokenizer_fingerprint")
+        require(
+            None in (fingerprint, prompt.fingerprint) or fingerprint == prompt.fingerprint,
+            f"{checkpoint.folder} was trained with another tokenizer ({brief(fingerprint)}) than"
+            f" {prompt.encoder!r} ({prompt.fingerprint}): its ids would mean other words. Set"
+            " processor.tokenizer to that one.",
+        )
     state = policy.state_dict()
     left = []
     components = policy.finetune_spec.components.items()
@@ -223,21 +232,6 @@ def _match_foreign(
     tensors = checkpoint.tensors(check_names)
     reduced, named, left = split(tensors)
     return reduced.translate(named, state, source), left
-
-
-def _check_tokenizer(policy: Policy, folder: Path) -> None:
-    """Refuse a start from weights whose token ids mean other words."""
-    if policy.processor is None or not (folder / CONFIG_FILE).is_file():
-        return
-    prompt = policy.processor.prompt_spec
-    fingerprint = read_settings(folder).get("tokenizer_fingerprint")
-    if fingerprint is None or prompt.fingerprint is None or fingerprint == prompt.fingerprint:
-        return
-    raise UserError(
-        f"{folder} was trained with another tokenizer ({brief(fingerprint)}) than"
-        f" {prompt.encoder!r} ({prompt.fingerprint}): its ids would mean other words. Set"
-        " processor.tokenizer to that one."
-    )
 
 
 def _reduced(
