@@ -32,6 +32,7 @@ from mme_vla.serving.remote.protocols import (
     LONGEST_CHUNK,
     PROTOCOLS,
     NewFrames,
+    ServerMetadata,
     ServerProtocol,
     count_of,
     detect,
@@ -244,7 +245,8 @@ class RemotePolicy(Policy):
             ) from None
         self.metadata = first.metadata
         first.close()
-        self.protocol.describe(self.metadata)
+        metadata = ServerMetadata.of(self.metadata)
+        self.protocol.describe(metadata)
 
         robot = self.protocol.robot
         self.memory = None
@@ -260,16 +262,16 @@ class RemotePolicy(Policy):
         if running is None and self.protocol.shares_memory:
             running = 1
         if running is None and name == "mme_vla":
-            running = count_of(self.metadata, "max_clients")
-        identity = _identity(choice, name, self.metadata)
+            running = count_of(metadata.max_clients)
+        identity = _identity(choice, name, metadata)
         self._server: dict[str, Any] = {
             "address": choice.server,
             "protocol": name,
             "metadata": json_value(self.metadata),
         }
         self.info = PolicyInfo(
-            sample_steps=count_of(self.metadata, "sample_steps") or 1,
-            max_actions=count_of(self.metadata, "max_actions"),
+            sample_steps=count_of(metadata.sample_steps) or 1,
+            max_actions=count_of(metadata.max_actions),
             resamples=False,
             max_running=running,
             identity=identity,
@@ -459,12 +461,12 @@ class _RefusedError(Exception):
     """The server refuses a request, or its reply cannot be read: another try would end alike."""
 
 
-def _identity(choice: ServerChoice, protocol: str, metadata: Mapping[str, Any]) -> PolicyIdentity:
+def _identity(choice: ServerChoice, protocol: str, metadata: ServerMetadata) -> PolicyIdentity:
     """What records call a served policy: what the command says, else the server, else the
     protocol.
     """
     connection = choice.connection
-    described = metadata.get("identity") if protocol == "mme_vla" else None
+    described = metadata.identity if protocol == "mme_vla" else None
     if isinstance(described, Mapping):
         identity = read_section(PolicyIdentity, described, "the server's identity")
         # These name folders of this machine.
