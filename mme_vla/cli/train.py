@@ -198,6 +198,7 @@ def _train(
             "card": {"data": run.data.name, "recipe": recipe(config)},
             TRAINING: identify(config, data.content),
         },
+        name=run.name,
     )
     line.say(trainer.describe())
     loggers = Loggers()

@@ -88,6 +88,7 @@ class Trainer:
         config: Mapping[str, Any],
         accelerator: Accelerator,
         facts: Mapping[str, Any] | None = None,
+        name: str = "policy",
     ) -> None:
         """Put the policy on its device, and back to where `run.checkpoint` left it.
 
@@ -98,11 +99,12 @@ class Trainer:
             config: the plain configuration, saved with every checkpoint.
             facts: sections that join the policy's own configuration in checkpoints: its training
                 and its card.
+            name: of the policy, for messages.
         """
         self.settings = settings
         self.run_info = run
         self.config = config
-        self.name = str(config.get("name", "policy"))
+        self.name = name
         self.accelerator = accelerator
         self.validation = validation
         self.facts = dict(facts or {})

@@ -238,7 +238,7 @@ class TrainRun:
         Args:
             config: plain and resolved.
         """
-        settings = TrainSettings.from_dict(config["train"], config["seed"])
-        run = read_section(cls, config, others=True, train=settings, config={})
+        run = read_section(cls, config, others=True, train={}, config={})
         check_budget(run.memory)
-        return replace(run, config=config)
+        train = TrainSettings.from_dict(config["train"], run.seed)
+        return replace(run, train=train, config=config)

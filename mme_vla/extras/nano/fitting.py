@@ -227,6 +227,7 @@ def train(job: Training) -> Path:
                 TRAINING: identify(full_config, content),
                 "card": card,
             },
+            name=str(PolicySections.of(full_config).name),
         )
         line = ProgressLine(train_settings.steps, run.step)
         loggers = open_loggers(folder, {}, run.step)

@@ -539,5 +539,6 @@ def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
         )
     probed = ProbedPolicy(policy, read_arm(f"distract:{count}"), episodes).eval()
     probed.info = replace(probed.info, n_distractor_episodes=count)
-    probed.config["sessions"] = [recording.name for recording in probed.sessions]
+    names = [recording.name for recording in probed.sessions]
+    probed.config = {**probed.config, "sessions": names}
     return probed
