@@ -238,7 +238,7 @@ class TrainRun:
         Args:
             config: plain and resolved.
         """
-        run = read_section(cls, config, others=True, train={}, config={})
+        settings = TrainSettings.from_dict(config["train"], config["seed"])
+        run = read_section(cls, config, others=True, train=settings, config={})
         check_budget(run.memory)
-        train = TrainSettings.from_dict(config["train"], run.seed)
-        return replace(run, train=train, config=config)
+        return replace(run, config=config)
