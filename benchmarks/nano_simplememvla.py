@@ -137,6 +137,7 @@ def train(files: Sequence[Path], output: Path, words: Sequence[str]) -> None:
             run,
             config,
             Accelerator(cpu=True),
+            name=str(config["name"]),
         )
         line, loggers = ProgressLine(settings.steps, run.step), open_loggers(output, {}, run.step)
         line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(learnt)} demonstrations")

@@ -27,7 +27,12 @@ def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) 
     """
     n, t = x.shape[:2]
     temporal = {i for i in range(len(layers)) if (i + 1) % every == 0} or {len(layers) - 1}
-    times = encode_time(t, x.shape[-1], x.device).to(x.dtype)[:, None]
+    # Sinusoidal encoding [t, 1, d] of the frames' times, exactly 0 at the last frame.
+    width = x.shape[-1]
+    ages = torch.arange(1 - t, 1, device=x.device, dtype=torch.float32)
+    pairs = torch.arange(0, width, 2, device=x.device, dtype=torch.float32)
+    angles = ages[:, None] * torch.exp(pairs * (-math.log(PERIOD) / width))
+    times = torch.stack([angles.sin(), angles.cos() - 1], -1).flatten(1).to(x.dtype)[:, None]
     earlier = torch.ones(t, t, dtype=torch.bool, device=x.device).tril()
     itself = torch.eye(t, dtype=torch.bool, device=x.device)
     # Padding attends to itself, so that no row is empty.
@@ -66,14 +71,3 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
     space_q, space_k = (part.transpose(1, 2).flatten(0, 1) for part in (q, k))  # n·t h p c
     output = functional.scaled_dot_product_attention(space_q, space_k, mixed.flatten(0, 1))
     return attention.proj(output.transpose(1, 2).flatten(2).unflatten(0, (n, t)))
-
-
-def encode_time(count: int, width: int, device: torch.device) -> Tensor:
-    """Sinusoidal encoding [count, width] float32 of the frames' times, exactly 0 at
-    the last frame.
-    """
-    ages = torch.arange(1 - count, 1, device=device, dtype=torch.float32)
-    pairs = torch.arange(0, width, 2, device=device, dtype=torch.float32)
-    rates = torch.exp(pairs * (-math.log(PERIOD) / width))
-    angles = ages[:, None] * rates
-    return torch.stack([angles.sin(), angles.cos() - 1], -1).flatten(1)

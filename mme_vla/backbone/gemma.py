@@ -416,7 +416,13 @@ class JointTransformer(nn.Module):
         segments = _segments(blocks, layout.dtype, self._compiled)
         is_compiled = self._compiled and not torch.is_grad_enabled()
         if is_compiled and not isinstance(condition, Tensor):  # while sampling: sums are deferred
-            segments = [self._with_update(segment, condition) for segment in segments]
+            # With updates of zeros, the first layer shares the compiled code of the others.
+            for i, segment in enumerate(segments):
+                gate = None
+                if segment.expert == self.action_expert and condition is not None:
+                    gate = condition.final.gate  # of any value; this is no other input of the layer
+                zeros = torch.zeros_like(segment.tokens)
+                segments[i] = segment._replace(update=zeros, gate=gate)
         cached: list[KeyValue | StaticKV] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, TimeModulations) else condition
@@ -444,15 +450,6 @@ class JointTransformer(nn.Module):
         if not keep:
             return output, None
         return output, KVCache(cached, layout.spans, layout.valid)
-
-    def _with_update(self, segment: Segment, condition: TimeModulations | None) -> Segment:
-        """A segment with an update of zeros: the first layer then shares the compiled code of the
-        others.
-        """
-        gate = None
-        if segment.expert == self.action_expert and condition is not None:
-            gate = condition.final.gate  # of any value; this one is no other input of the layer
-        return segment._replace(update=torch.zeros_like(segment.tokens), gate=gate)
 
     # Sampling
 

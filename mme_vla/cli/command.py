@@ -169,7 +169,8 @@ def _check_command_line(config_name: str, tree: Path, check: str) -> None:
         if names_output and output is not None:
             check_output(str(output))
         # What a plugin registers is known only once it is imported, which `job` does.
-        if check and not args.cfg and not cfg.get("plugins") and not OmegaConf.missing_keys(cfg):
+        named = plugins.plugins_of(cfg, "the configuration")
+        if check and not args.cfg and not named and not OmegaConf.missing_keys(cfg):
             pkgutil.resolve_name(check)(resolved(cfg))
 
 

@@ -78,7 +78,14 @@ def check_site(folder: Path) -> None:
         folders.update(parent.as_posix() for parent in Path(name).parents)
     other_files: list[str] = []
     for path in folder.rglob("*"):
-        if not _is_generated(path, folder, sums, folders):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            is_generated = False
+        elif path.is_dir():
+            is_generated = name in folders
+        else:
+            is_generated = name == FILES or (name in sums and file_sum(path) == sums[name])
+        if not is_generated:
             other_files.append(path.name)
         if len(other_files) == 5:  # not all of them: the folder may be a home folder
             break
@@ -88,15 +95,6 @@ def check_site(folder: Path) -> None:
         f" {listed(sorted(other_files))}. A new site replaces the whole folder: choose another, or"
         " remove this one yourself.",
     )
-
-
-def _is_generated(path: Path, folder: Path, sums: dict[str, str], folders: set[str]) -> bool:
-    name = path.relative_to(folder).as_posix()
-    if path.is_symlink():
-        return False
-    if path.is_dir():
-        return name in folders
-    return name == FILES or (name in sums and file_sum(path) == sums[name])
 
 
 def _replace(draft: Path, target: Path) -> None:

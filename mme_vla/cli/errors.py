@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn, TextIO
+from typing import NoReturn
 
 from mme_vla.errors import ERROR, UserError, printable
 from mme_vla.utils.io import disk_trouble
@@ -32,7 +32,10 @@ def print_user_errors() -> Iterator[None]:
         try:
             yield
         except BrokenPipeError:
-            if not _has_no_reader(sys.stdout):
+            # Standard output is a pipe whose other end is closed, or another pipe broke.
+            poll = select.poll()
+            poll.register(sys.stdout, 0)
+            if not any(event & select.POLLERR for _, event in poll.poll(0)):
                 raise
         except KeyboardInterrupt as stop:
             _end_interrupted(stop)
@@ -69,13 +72,6 @@ def _end_interrupted(stop: KeyboardInterrupt) -> NoReturn:
         "Stopped",
     )
     raise SystemExit(128 + number) from None
-
-
-def _has_no_reader(stream: TextIO) -> bool:
-    """Whether a stream is a pipe whose other end is closed."""
-    poll = select.poll()
-    poll.register(stream, 0)
-    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from mme_vla.data.lerobot_files import SAMPLE, find_columns, read_info, resolve_
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.recording import Recording
 from mme_vla.data.robot_draft import CHECK, draft_robot, save_draft
-from mme_vla.data.sources import default_val_episodes, held_out_in, listed_sources, source_name
+from mme_vla.data.sources import default_val_episodes, held_out_in, listed_sources
 from mme_vla.data.statistics import normalised_states
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.action_space import numbered
@@ -225,7 +225,7 @@ def held_out_episodes(
     entries = listed_sources(data.sources)
     entry = entries[content.index(source.fingerprint)]
     # The split goes by the name that the dataset had then.
-    source.name = source_name(entry)
+    source.name = entry.short_name
     texts: Sequence[int | str] | None = data.val_episodes
     if texts is None:
         texts = default_val_episodes([source])
@@ -344,7 +344,7 @@ def training_rows(folder: Path, sections: PolicySections) -> list[tuple[str, str
         state = read_state(folder)
         data = state["config"].get("data", {})
         train = state["config"].get("train", {})
-        known = ", ".join(source_name(entry) for entry in listed_sources(data.get("sources")))
+        known = ", ".join(entry.short_name for entry in listed_sources(data.get("sources")))
         steps = f"{state['step']:,} of {train.get('steps', 0):,} updates"
         steps += f", batches of {train.get('batch_size')}, learning rate {train.get('lr')}"
         steps += f", seed {state['config'].get('seed')}"

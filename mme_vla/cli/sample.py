@@ -28,28 +28,6 @@ OPTIONS = ConvertOptions(pix_fmt="yuv420p", gop=32)
 LIMIT = 6_000_000
 
 
-def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
-    """Write the sample and return its size in bytes."""
-    folders = {"full": full, "thinned": thinned}
-    refs = []
-    for kind, task, number in EPISODES:
-        ref = EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task)
-        require(
-            ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it."
-        )
-        refs.append(ref)
-    readme = (SAMPLE / "README.md").read_text()  # of the shipped sample, which this replaces
-    convert(refs, output, OPTIONS)
-    (output / "README.md").write_text(readme)
-    size = sum(file.stat().st_size for file in output.rglob("*") if file.is_file())
-    if size > LIMIT:
-        shutil.rmtree(output)
-        raise UserError(
-            f"The sample would take {size / 1e6:.1f} MB; the limit is {LIMIT / 1e6:.0f} MB."
-        )
-    return size
-
-
 def main() -> None:
     """Run `mme-vla sample`."""
     parser = argument_parser(
@@ -66,5 +44,22 @@ def main() -> None:
         help="new dataset folder (default: inside the package)",
     )
     arguments = parser.parse_args()
-    size = make_sample(arguments.full, arguments.thinned, arguments.output)
-    print(f"{arguments.output}: {size / 1e6:.2f} MB")
+    output = arguments.output
+    folders = {"full": arguments.full, "thinned": arguments.thinned}
+    refs = []
+    for kind, task, number in EPISODES:
+        ref = EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task)
+        require(
+            ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it."
+        )
+        refs.append(ref)
+    readme = (SAMPLE / "README.md").read_text()  # of the shipped sample, which this replaces
+    convert(refs, output, OPTIONS)
+    (output / "README.md").write_text(readme)
+    size = sum(file.stat().st_size for file in output.rglob("*") if file.is_file())
+    if size > LIMIT:
+        shutil.rmtree(output)
+        raise UserError(
+            f"The sample would take {size / 1e6:.1f} MB; the limit is {LIMIT / 1e6:.0f} MB."
+        )
+    print(f"{output}: {size / 1e6:.2f} MB")

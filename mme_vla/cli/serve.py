@@ -4,13 +4,11 @@ import asyncio
 import logging
 import os
 import signal
-from pathlib import Path
 
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling
-from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
 from mme_vla.policy.saving import local_folder
 from mme_vla.policy.self_check import NO_CHECK, IncomparableError, compare
@@ -28,7 +26,18 @@ def main(cfg: DictConfig) -> None:
     log_to_terminal(logger, clock=True)
     policy, name, source = load_policy(choice, "serve", logger)
     if source is not None:
-        _report_self_check(policy, local_folder(source, choice.revision))
+        # Whether the policy predicts what it predicted where it was trained.
+        try:
+            result = compare(policy, local_folder(source, choice.revision))
+        except IncomparableError as error:
+            logger.warning("%s", error)
+        else:
+            if result is None:
+                logger.info("%s", NO_CHECK)
+            elif result.passed:
+                logger.info("%s", result.line)
+            else:
+                logger.warning("%s", result.line)
     prepare_sampling(policy, str(cfg.sampling), logger)
     trained = choice.checkpoint is not None
     server = PolicyServer(policy, settings, name=name, trained=trained, source=source)
@@ -42,21 +51,6 @@ def main(cfg: DictConfig) -> None:
             server.metadata["subgoal"],
         )
     asyncio.run(run(server))
-
-
-def _report_self_check(policy: Policy, folder: Path) -> None:
-    """Log in one line whether a policy predicts what it predicted where it was trained."""
-    try:
-        result = compare(policy, folder)
-    except IncomparableError as error:
-        logger.warning("%s", error)
-        return
-    if result is None:
-        logger.info("%s", NO_CHECK)
-    elif result.passed:
-        logger.info("%s", result.line)
-    else:
-        logger.warning("%s", result.line)
 
 
 async def run(server: PolicyServer) -> None:

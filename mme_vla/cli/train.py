@@ -89,7 +89,8 @@ def train_several(run: TrainRun, folder: Path) -> list[Path]:
     checkpoints = []
     for number in range(run.trainings):
         place = folder / training_name(number)
-        one = run.with_keys(seed=run.seed + number, output=str(place), resume="auto")
+        own = {"seed": run.seed + number, "output": str(place), "resume": "auto"}
+        one = TrainRun.from_config({**run.config, **own})
         existing = open_run(place, "auto", one.config)
         is_finished = (place / SUMMARY).is_file() and existing.step == one.train.steps
         if is_finished and existing.checkpoint is not None:
@@ -124,7 +125,7 @@ def train(
         SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the
             signal's number.
     """
-    check_logger(run.config)
+    check_logger(run.logger)
     if run.train.device == "cuda":
         find_device("cuda")  # says so where there is none
     # Where processes have all weights each, gradients lie in what is sent instead of being copied
@@ -197,11 +198,12 @@ def _train(
             "card": {"data": run.data.name, "recipe": recipe(config)},
             TRAINING: identify(config, data.content),
         },
+        name=run.name,
     )
     line.say(trainer.describe())
     loggers = Loggers()
     if first:
-        loggers = open_loggers(place.folder, saved_config, place.step)
+        loggers = open_loggers(place.folder, saved_config, place.step, run.logger)
         remove_drafts(place.folder)
         with write_atomically(place.folder / CONFIG) as draft:
             OmegaConf.save(OmegaConf.create(config), draft)
@@ -216,11 +218,6 @@ def _train(
     return trainer
 
 
-def _building(has_weights: bool) -> AbstractContextManager[object]:
-    """Where modules are built: without weights, on meta."""
-    return nullcontext() if has_weights else torch.device("meta")
-
-
 def build_trainee(
     run: TrainRun, place: Run, has_weights: bool, line: ProgressLine, tower_seed: int | None
 ) -> Policy:
@@ -231,7 +228,11 @@ def build_trainee(
     init_from = None if place.checkpoint is not None else weights_to_start_from(run.init_from)
     # A backbone whose weights are about to be replaced is not initialised first.
     fresh = place.checkpoint is None and init_from is None
-    with _building(has_weights):
+    # Without weights, modules are built on meta.
+    place_of_modules: AbstractContextManager[object] = nullcontext()
+    if not has_weights:
+        place_of_modules = torch.device("meta")
+    with place_of_modules:
         policy = build_from_config(cfg, fresh_backbone=fresh)
         if fresh and has_weights and tower_seed not in (None, run.seed):
             copy_tower(build_from_config(cfg, seed=tower_seed), policy)
@@ -240,7 +241,7 @@ def build_trainee(
         line.say(start_from(policy, init_from))
     if fresh and line.visible:
         warn_of_frozen_random_weights(run.finetune.mode)
-    with _building(has_weights):
+    with place_of_modules:
         apply_finetuning(policy, **vars(run.finetune), seed=run.seed)
     if place.checkpoint is not None:
         if has_weights:
@@ -269,12 +270,22 @@ def open_data(
     if accelerator.is_main_process and policy.memory is not None:
         encoder[0] = policy.vision_fingerprint()
     encoder = broadcast_object_list(encoder)
+    # The command that builds the vision cache of this run: the same words, but for those on
+    # resuming and output.
+    words = ["mme-vla", "cache", "model=<model>", "data=<data>"]
+    if HydraConfig.initialized():
+        words = words[:2]
+        for tree in command_trees()[1:]:
+            words += ["--config-dir", str(tree)]
+        for word in HydraConfig.get().overrides.task:
+            if not word.startswith(("resume=", "output=", "trainings=")):
+                words.append(word)
     first_one = accelerator.main_process_first
     if run.data.cache.local:
         first_one = accelerator.local_main_process_first
     with first_one():
         data = prepare_data(
-            policy, run.data, run.seed, place.checkpoint, cache_command(), line.say, encoder[0]
+            policy, run.data, run.seed, place.checkpoint, shlex.join(words), line.say, encoder[0]
         )
     if place.checkpoint is not None:
         check_content(place.checkpoint, data.content)
@@ -314,18 +325,3 @@ def recipe(config: dict[str, Any]) -> dict[str, Any]:
     """The settings of the training that a model card lists."""
     settings = config["train"].items()
     return {key: value for key, value in settings if not isinstance(value, dict)}
-
-
-def cache_command() -> str:
-    """The command that builds the vision cache of this run: the same words, but for those on
-    resuming and output.
-    """
-    if not HydraConfig.initialized():
-        return shlex.join(["mme-vla", "cache", "model=<model>", "data=<data>"])
-    words = ["mme-vla", "cache"]
-    for tree in command_trees()[1:]:
-        words += ["--config-dir", str(tree)]
-    for word in HydraConfig.get().overrides.task:
-        if not word.startswith(("resume=", "output=", "trainings=")):
-            words.append(word)
-    return shlex.join(words)

@@ -75,8 +75,18 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
     trust: the user has said that what it names may run here.
     """
     names = plugins_of(config, source)
-    installed = [module for module in _installed_parts(config) if module not in names]
-    strange = [name for name in [*names, *installed] if name not in sys.modules]
+    # Parts of installed packages are imported when they are built. Every text of the configuration
+    # may name one, wherever it is: the kind of a part is known only then.
+    module_of: dict[str, str] = {}
+    for extension in installed_extensions():
+        for parts in extension.parts.values():
+            module_of.update(parts)
+    required = dict.fromkeys(names)  # in order, each once
+    if module_of:
+        for text in _texts(config):
+            if text in module_of:
+                required[module_of[text]] = None
+    strange = [name for name in required if name not in sys.modules]
     require(
         not strange or trust,
         f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that"
@@ -85,24 +95,6 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
         " with it installed.",
     )
     import_plugins(names)
-
-
-def _installed_parts(config: Any) -> list[str]:
-    """Modules of installed packages that a configuration's names would import.
-
-    Every text counts, wherever it is: the kind of a part is known only when it is built.
-    """
-    modules: dict[str, str] = {}
-    for extension in installed_extensions():
-        for parts in extension.parts.values():
-            modules.update(parts)
-    if not modules:
-        return []
-    named: dict[str, None] = {}  # in order, each once
-    for text in _texts(config):
-        if text in modules:
-            named[modules[text]] = None
-    return list(named)
 
 
 def _texts(values: Any) -> Iterator[str]:

@@ -70,6 +70,12 @@ PathText = Annotated[str, BeforeValidator(_number_as_text)]
 """A path or a name. A command line reads a folder called `7` as a number."""
 
 
+Secret = Annotated[PathText | None, BeforeValidator(lambda value: value or None)]
+"""A key that a server asks for. An empty environment variable, as compose files leave it, is no
+key.
+"""
+
+
 def read_section[T](
     kind: type[T], values: Any, where: str = "", *, others: bool = False, **fixed: Any
 ) -> T:

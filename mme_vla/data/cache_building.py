@@ -208,7 +208,12 @@ def _build_episode(
                 raise ValueError(
                     f"encode() gave {list(tokens.shape)} for {len(chunk.stored_images)} frames"
                 )
-            rows.append(_to_numpy(tokens, dtype))
+            tokens = tokens.detach()
+            if dtype == "bfloat16":  # which numpy does not know
+                stored = tokens.to(torch.bfloat16).view(torch.uint16)
+            else:
+                stored = tokens.float()
+            rows.append(stored.cpu().numpy())
         advance(chunk.length)
     drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
@@ -235,12 +240,6 @@ def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
     described += b" " * (PAGE - 11 - len(described)) + b"\n"
     file.write(magic + len(described).to_bytes(2, "little") + described)
     file.write(np.ascontiguousarray(array).data)
-
-
-def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
-    if dtype == "bfloat16":
-        return tokens.detach().to(torch.bfloat16).view(torch.uint16).cpu().numpy()
-    return tokens.detach().float().cpu().numpy()
 
 
 def _draft(

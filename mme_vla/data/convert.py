@@ -23,7 +23,6 @@ from mme_vla.data.hdf5 import (
     SUBGOALS,
     EpisodeRef,
     RawEpisode,
-    RawFrame,
     open_episode,
     recorded_options,
 )
@@ -44,7 +43,7 @@ from mme_vla.utils import (
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
+    pass
 
 
 @contextmanager
@@ -81,18 +80,6 @@ def _columns(root: Path) -> dict[str, list[Any]]:
 TILES, COLUMNS, SIDE = 12, 6, 192
 
 
-def episode_sheet(frames: Sequence[RawFrame], title: str) -> "Image":
-    """Front views spread evenly over an episode, each with its step and sub-task."""
-    tiles = []
-    for step in evenly_spaced(len(frames), TILES):
-        frame = frames[step]
-        outline = RED if frame.is_demo else None
-        tiles.append(
-            Tile(frame.front, f"{step} {frame.subgoals['simple_subgoal_online']}", outline)
-        )
-    return contact_sheet(tiles, COLUMNS, title, side=SIDE)
-
-
 def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Path, Path]:
     """Write `<task>-<index>.png` and `.mp4` of a recorded episode; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -101,7 +88,14 @@ def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Pat
     with open_episode(EpisodeRef(file, index, task)) as episode:
         frames = list(episode)
         goal = episode.goals[0]
-    episode_sheet(frames, f"{task} {index}: {goal}").save(sheet)
+    # Front views spread evenly over the episode, each with its step and sub-task.
+    tiles = []
+    for step in evenly_spaced(len(frames), TILES):
+        frame = frames[step]
+        outline = RED if frame.is_demo else None
+        text = f"{step} {frame.subgoals['simple_subgoal_online']}"
+        tiles.append(Tile(frame.front, text, outline))
+    contact_sheet(tiles, COLUMNS, f"{task} {index}: {goal}", side=SIDE).save(sheet)
     images = (
         video_frame((f.front, f.wrist), f.subgoals["simple_subgoal_online"], f.is_demo)
         for f in frames

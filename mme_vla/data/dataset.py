@@ -161,7 +161,14 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             " processor.prompt=plain.",
         )
         if subgoal is not None:
-            _check_subgoals(sources, subgoal)
+            for source in sources:
+                lacking = sorted(set(subgoal.columns) - set(source.subgoal_names))
+                require(
+                    not lacking,
+                    f"{source.name} has no {' and no '.join(lacking)}, which"
+                    f" subgoal_text.kind={subgoal.kind} reads; its subgoal texts are:"
+                    f" {', '.join(source.subgoal_names) or 'none'}.",
+                )
         rate = processor.embodiment.fps
         if processor.samples.history is not None and rate is not None:
             for source in sources:
@@ -395,17 +402,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             subgoal=subgoal,
             past_actions=self.past_actions(step, frames),
             actions=step.actions,
-        )
-
-
-def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:
-    for source in sources:
-        lacking = sorted(set(subgoal.columns) - set(source.subgoal_names))
-        require(
-            not lacking,
-            f"{source.name} has no {' and no '.join(lacking)}, which"
-            f" subgoal_text.kind={subgoal.kind} reads; its subgoal texts are:"
-            f" {', '.join(source.subgoal_names) or 'none'}.",
         )
 
 

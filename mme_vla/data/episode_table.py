@@ -107,7 +107,18 @@ def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable
                 f"{meta}: {name} of episode {episode} is {value}; expected {expected}. {REMEDY}"
             )
     starts, stops = columns["dataset_from_index"], columns["dataset_to_index"]
-    tasks = [_listed_tasks(meta, episode, cell) for episode, cell in enumerate(cells)]
+    # LeRobot writes a list of texts; one text alone, an empty list or nothing is read too.
+    tasks: list[tuple[str, ...]] = []
+    for episode, cell in enumerate(cells):
+        texts = cell if isinstance(cell, list) else [cell]
+        if cell is None:
+            texts = []
+        if not all(isinstance(text, str) for text in texts):
+            raise UserError(
+                f"{meta}: tasks of episode {episode} is {brief(cell)}; expected a list of texts."
+                f" {REMEDY}"
+            )
+        tasks.append(tuple(texts))
     return EpisodeTable(starts, stops - starts, tasks, columns.get("length"), videos)
 
 
@@ -178,18 +189,3 @@ def _validity(
         is_time = np.isfinite(spans.begin) & (spans.begin >= 0)
         checks[f"videos/{column}/from_timestamp"] = (is_time, "seconds from 0")
     return checks
-
-
-def _listed_tasks(meta: Path, episode: int, cell: Any) -> tuple[str, ...]:
-    """The tasks of an episode: LeRobot writes a list of texts; one text alone, an empty list or
-    nothing is read too.
-    """
-    if cell is None:
-        return ()
-    texts = cell if isinstance(cell, list) else [cell]
-    if not all(isinstance(text, str) for text in texts):
-        raise UserError(
-            f"{meta}: tasks of episode {episode} is {brief(cell)}; expected a list of texts."
-            f" {REMEDY}"
-        )
-    return tuple(texts)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.config.sections import PathText, read_section
 from mme_vla.data.consistency import compare_names
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.errors import UserError, require
 
 log = logging.getLogger(__name__)
 
@@ -99,26 +100,36 @@ def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
     return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
 
 
-_KEYS = ("root", "name", "exec_starts")
+@dataclass(frozen=True)
+class SourceEntry:
+    """An entry of `data.sources`: arguments of `EpisodeSource`."""
+
+    root: PathText
+    name: PathText | None = None
+    exec_starts: PathText | None = None
+
+    def __post_init__(self) -> None:
+        require(self.root, "A data source needs its dataset folder: root=<folder>, or 'sample'.")
+
+    @property
+    def short_name(self) -> str:
+        """The dataset's name, as `EpisodeSource` gives it."""
+        if self.name:
+            return self.name
+        return self.root if self.root == "sample" else Path(self.root).resolve().name
 
 
 def listed_sources(
     entries: str | Mapping[str, Any] | Sequence[str | Mapping[str, Any]],
-) -> list[str | Mapping[str, Any]]:
-    """`data.sources` as a list; one entry may stand without a list around it."""
+) -> list[SourceEntry]:
+    """Read `data.sources`; one entry may stand without a list around it."""
     listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
     require(listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
-    return listed
-
-
-def source_name(entry: str | Mapping[str, Any]) -> str:
-    """The short name of the dataset of an entry of `data.sources`, as `EpisodeSource` gives it."""
-    root = str(entry)
-    if isinstance(entry, Mapping):
-        root = str(entry.get("root"))
-        if entry.get("name"):
-            return str(entry["name"])
-    return root if root == "sample" else Path(root).resolve().name
+    sources = []
+    for entry in listed:
+        section = entry if isinstance(entry, Mapping) else {"root": entry}
+        sources.append(read_section(SourceEntry, section, "data.sources"))
+    return sources
 
 
 def open_sources(
@@ -129,28 +140,46 @@ def open_sources(
     exec_starts.
 
     `robot` says which columns hold its images, states and actions.
+
+    Raises:
+        UserError: two have one name, or the same names of numbers in another order.
     """
     sources = []
     for entry in listed_sources(entries):
-        options = {"root": entry} if isinstance(entry, str) else dict(entry)
-        for key in options:
-            require(
-                key in _KEYS,
-                f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}",
-            )
-        require(
-            options.get("root"),
-            "A data source needs its dataset folder: root=<folder>, or 'sample'.",
-        )
-        sources.append(EpisodeSource(**options, robot=robot))
+        sources.append(EpisodeSource(entry.root, entry.exec_starts, entry.name, robot=robot))
     names = [source.name for source in sources]
     if len(set(names)) < len(names):
         raise UserError(
             f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its"
             " own."
         )
-    for other in sources[1:]:
-        compare_sources(sources[0], other)
+    # They are trained on together. Other rates and other sizes of numbers (degrees beside radians)
+    # are a warning: both may be meant.
+    first = sources[0]
+    for second in sources[1:]:
+        for kind, first_names, second_names in (
+            ("state", first.state_names, second.state_names),
+            ("action", first.action_names, second.action_names),
+        ):
+            compare_names(
+                first_names,
+                second_names,
+                kind,
+                f"the source {first.name}",
+                f"the source {second.name}",
+                "Trained together, one number would mean two things: bring one dataset's columns"
+                " into the other's order.",
+            )
+            _compare_scales(first, second, kind)
+        if first.fps != second.fps:
+            log.warning(
+                "The source %s has %g frames per second, %s has %g: one step of a chunk is another"
+                " time in each.",
+                first.name,
+                first.fps,
+                second.name,
+                second.fps,
+            )
     return sources
 
 
@@ -158,40 +187,6 @@ UNITS_APART = 20
 """How many times larger one source's numbers are than the other's where units differ: 57 from
 radians to degrees.
 """
-
-
-def compare_sources(first: EpisodeSource, second: EpisodeSource) -> None:
-    """Compare two datasets that are trained on together.
-
-    Other rates and other sizes of numbers (degrees beside radians) are a warning: both may be
-    meant.
-
-    Raises:
-        UserError: their numbers have the same names in another order.
-    """
-    for kind, first_names, second_names in (
-        ("state", first.state_names, second.state_names),
-        ("action", first.action_names, second.action_names),
-    ):
-        compare_names(
-            first_names,
-            second_names,
-            kind,
-            f"the source {first.name}",
-            f"the source {second.name}",
-            "Trained together, one number would mean two things: bring one dataset's columns into"
-            " the other's order.",
-        )
-        _compare_scales(first, second, kind)
-    if first.fps != second.fps:
-        log.warning(
-            "The source %s has %g frames per second, %s has %g: one step of a chunk is another time"
-            " in each.",
-            first.name,
-            first.fps,
-            second.name,
-            second.fps,
-        )
 
 
 def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> None:

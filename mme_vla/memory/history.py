@@ -339,23 +339,16 @@ class OnlineHistory(History):
         if len(tokens):
             start = len(self._stored_frames)
             stop = start + len(tokens)
-            self._grow(stop, tokens)
+            capacity = 0 if self._tokens is None else len(self._tokens)
+            if stop > capacity:
+                larger = tokens.new_empty((max(stop, 2 * capacity, 16), *tokens.shape[1:]))
+                if self._tokens is not None:
+                    larger[:start] = self._tokens[:start]
+                self._tokens = larger
             assert self._tokens is not None
             self._tokens[start:stop] = tokens
             self._stored_frames.extend((offsets + self._length).tolist())
         self._length += count
-
-    def _add_score(self, frame: int, values: np.ndarray) -> None:
-        row = self._n_scores
-        if row == len(self._scores.frames):
-            more = max(row, 16)
-            self._scores = FrameScores(
-                np.concatenate([self._scores.frames, np.zeros(more, np.int64)]),
-                np.concatenate([self._scores.values, np.zeros((more, len(values)), np.float32)]),
-            )
-        self._scores.frames[row] = frame
-        self._scores.values[row] = values
-        self._n_scores += 1
 
     def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches,
@@ -375,18 +368,20 @@ class OnlineHistory(History):
             return
         for frame, image in zip((offsets + self._length).tolist(), frames, strict=True):
             values = self._scorer(frame, image)
-            if values is not None:
-                self._add_score(frame, values)
-
-    def _grow(self, needed: int, like: Tensor) -> None:
-        capacity = 0 if self._tokens is None else len(self._tokens)
-        if needed <= capacity:
-            return
-        larger = like.new_empty((max(needed, 2 * capacity, 16), *like.shape[1:]))
-        if self._tokens is not None:
-            used = len(self._stored_frames)
-            larger[:used] = self._tokens[:used]
-        self._tokens = larger
+            if values is None:
+                continue
+            # The arrays double where they are full.
+            row = self._n_scores
+            if row == len(self._scores.frames):
+                more = max(row, 16)
+                empty = np.zeros((more, len(values)), np.float32)
+                self._scores = FrameScores(
+                    np.concatenate([self._scores.frames, np.zeros(more, np.int64)]),
+                    np.concatenate([self._scores.values, empty]),
+                )
+            self._scores.frames[row] = frame
+            self._scores.values[row] = values
+            self._n_scores += 1
 
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:

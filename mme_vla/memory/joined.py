@@ -13,7 +13,6 @@ from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
     NEVER,
     MemoryModule,
-    PastViewSpec,
     pad_selection,
     union_frames,
 )
@@ -74,9 +73,13 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         self.uses_proprio = any(member.uses_proprio for member in built)
         self.reads_labels = labels_read(*built)
         self.lazy = all(member.lazy for member in built)
-        self.past_view_spec = single_past_view_spec(
-            {name: one.past_view_spec for name, one in by_name.items()}
+        viewing = [name for name, one in by_name.items() if one.past_view_spec is not None]
+        require(
+            len(viewing) <= 1,
+            f"{' and '.join(viewing)} each give the vision tower past views: join only one of"
+            " them.",
         )
+        self.past_view_spec = by_name[viewing[0]].past_view_spec if viewing else None
         # Indices of the members in the order in which their selections follow one another.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
@@ -356,13 +359,3 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
         keep_every=math.gcd(*(spec.keep_every for spec in stored.values())),
         scorer=next(iter(keys), ""),
     )
-
-
-def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewSpec | None:
-    """The past views of the one member that has any; None where none has."""
-    defined = {name: spec for name, spec in specs.items() if spec is not None}
-    require(
-        len(defined) <= 1,
-        f"{' and '.join(defined)} each give the vision tower past views: join only one of them.",
-    )
-    return next(iter(defined.values()), None)

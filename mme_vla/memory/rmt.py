@@ -114,20 +114,16 @@ class RMTLayer(RecurrentLayer):
         self, x: Tensor, weight: Tensor, rope: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Project x [..., n, hidden] to heads [..., n, heads, h], and rotate all but the values,
-        which are last.
+        which are last: their pairs (2i, 2i + 1), by angles with cosines and sines [n, 1, h/2].
         """
         heads = nn.functional.linear(x, weight).unflatten(-1, (-1, self.head_dim))
         qk, v = heads.tensor_split([-self.kv_heads], -2)
-        return self._rotate(qk, *rope), v
-
-    def _rotate(self, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-        """Rotate the pairs (2i, 2i + 1) of [..., n, heads, h] by angles with cosines and sines [n,
-        1, h/2].
-        """
-        a, b = x[..., 0::2], x[..., 1::2]
+        cos, sin = rope
+        a, b = qk[..., 0::2], qk[..., 1::2]
+        rotated = [a * cos - b * sin, a * sin + b * cos]
         if self.rotation == "cosine_only":
-            return torch.stack([a * cos, b * cos], -1).flatten(-2)
-        return torch.stack([a * cos - b * sin, a * sin + b * cos], -1).flatten(-2)
+            rotated = [a * cos, b * cos]
+        return torch.stack(rotated, -1).flatten(-2), v
 
     def _attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Every slot attends to every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n,
@@ -137,27 +133,22 @@ class RMTLayer(RecurrentLayer):
         # Without a mask, the queries that share a key head are simply more queries of that head.
         q = q.unflatten(2, (self.kv_heads, -1)).permute(0, 2, 3, 1, 4).flatten(2, 3)  # b kv (g n) h
         k, v = k.transpose(1, 2), v.transpose(1, 2)
-        if self.attention_dtype == torch.float32:
+        dtype = self.attention_dtype
+        if dtype == torch.float32:
             mixed = nn.functional.scaled_dot_product_attention(q, k, v)
         else:
-            mixed = attend_rounded(q, k, v, self.attention_dtype)
+            # Round where the released code does: inputs, weights and result to `dtype`; softmax in
+            # float32. Fused kernels round the weights before they are normalised, which moves a
+            # slot by up to 2 % over a window.
+            q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
+            scores = (q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)
+            weights = scores.softmax(-1).to(dtype)
+            if q.device.type == "cpu":
+                # Sums are float32 either way, and many CPUs only emulate products of bfloat16.
+                mixed = (weights.float() @ v.float()).to(dtype).float()
+            else:
+                mixed = (weights @ v).float()
         return mixed.view(b, heads, n, h).transpose(1, 2).flatten(2)
-
-
-def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
-    """Attention that rounds where the released code does: inputs, weights and result to `dtype`;
-    softmax in float32.
-
-    Fused kernels round the weights before they are normalised, which moves a slot by up to 2 % over
-    a window.
-    """
-    q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
-    scores = (q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)
-    weights = scores.softmax(-1).to(dtype)
-    if q.device.type == "cpu":
-        # Sums are float32 either way, and many CPUs only emulate products of bfloat16.
-        return (weights.float() @ v.float()).to(dtype).float()
-    return (weights @ v).float()
 
 
 @torch.no_grad()

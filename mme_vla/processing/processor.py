@@ -1,7 +1,7 @@
 """`Processor`: what stands between raw data and a network that reads prompts, π0.5's above all."""
 
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -52,40 +52,6 @@ from mme_vla.utils import Sums, checked_file, inside
 TOKENIZER_FILE = "tokenizer.model"
 
 
-def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) -> dict[str, Any]:
-    """The arguments of a processor's constructor out of the words of `Processor.from_config`.
-
-    Args:
-        arguments: the constructor's, by name.
-    """
-    settings = dict(config)
-    known = {*arguments, "tokenizer_fingerprint"}
-    for key in settings:
-        if key not in known:
-            raise UserError(
-                f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}"
-            )
-    for key in ("image_size", "tokenizer", "embodiment"):
-        require(
-            key in settings,
-            f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.",
-        )
-    PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
-    settings["embodiment"] = Embodiment.from_dict(settings["embodiment"])
-    fingerprint = settings.pop("tokenizer_fingerprint", None)
-    tokenizer = Tokenizer.load(settings["tokenizer"])
-    if fingerprint is not None and tokenizer.fingerprint != fingerprint:
-        raise UserError(
-            f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but"
-            f" {brief(fingerprint)} was used in training: its ids would mean other words. Give the"
-            " file that was used."
-        )
-    settings["tokenizer"] = tokenizer
-    if settings.get("stats") is not None:
-        settings["stats"] = NormStats.load(settings["stats"])
-    return settings
-
-
 def saved_file(folder: Path, name: Any, what: str) -> Path:
     """The path of a file that a checkpoint names in itself; where the folder has checksums, it must
     have one.
@@ -95,26 +61,6 @@ def saved_file(folder: Path, name: Any, what: str) -> Path:
         f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.",
     )
     return checked_file(folder, name, what)
-
-
-def saved_tokenizer(folder: Path, name: Any) -> str | Path:
-    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub;
-    no other address.
-    """
-    if name in (SAMPLE, PALIGEMMA):
-        return str(name)
-    if isinstance(name, str) and name.startswith(HUB):
-        if (folder / TOKENIZER_FILE).is_file():
-            # it may be added later: its fingerprint is in processor.json
-            Sums(folder).check(TOKENIZER_FILE)
-            return inside(folder, TOKENIZER_FILE, "tokenizer")
-        raise UserError(
-            f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not"
-            " fetched on a checkpoint's word. If you trust it: from_pretrained(…,"
-            f" tokenizer={brief(name, 200)}), or download that file into the folder as"
-            f" {TOKENIZER_FILE}."
-        )
-    return saved_file(folder, name, "tokenizer")
 
 
 @PROCESSORS.register("pi05")
@@ -356,7 +302,33 @@ class Processor(PolicyProcessor):
                 `embodiment` as `Embodiment.to_dict` writes it. `tokenizer_fingerprint`, if given,
                 is checked.
         """
-        return cls(**constructor_settings(config, inspect.signature(cls).parameters))
+        settings = dict(config)
+        known = {*inspect.signature(cls).parameters, "tokenizer_fingerprint"}
+        for key in settings:
+            if key not in known:
+                raise UserError(
+                    f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}"
+                )
+        for key in ("image_size", "tokenizer", "embodiment"):
+            require(
+                key in settings,
+                f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.",
+            )
+        PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
+        settings["embodiment"] = Embodiment.from_dict(settings["embodiment"])
+        fingerprint = settings.pop("tokenizer_fingerprint", None)
+        tokenizer = Tokenizer.load(settings["tokenizer"])
+        if fingerprint is not None and tokenizer.fingerprint != fingerprint:
+            raise UserError(
+                f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but"
+                f" {brief(fingerprint)} was used in training: its ids would mean other words. Give"
+                " the file that was used."
+            )
+        settings["tokenizer"] = tokenizer
+        stats = settings.pop("stats", None)
+        if stats is not None:
+            settings["stats"] = NormStats.load(stats)
+        return cls(**settings)
 
     def save(self, folder: Path | str) -> list[str]:
         """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the
@@ -381,8 +353,22 @@ class Processor(PolicyProcessor):
         folder = Path(folder)
         config = read_settings(folder)
         # Its files are in the folder, and have their checksums.
-        if tokenizer is None:
-            tokenizer = saved_tokenizer(folder, config.get("tokenizer", ""))
+        named = config.get("tokenizer", "")
+        if tokenizer is None and named in (SAMPLE, PALIGEMMA):
+            tokenizer = str(named)
+        elif tokenizer is None and isinstance(named, str) and named.startswith(HUB):
+            if not (folder / TOKENIZER_FILE).is_file():
+                raise UserError(
+                    f"{folder} takes its tokenizer from the network, at {brief(named, 200)}, which"
+                    " is not fetched on a checkpoint's word. If you trust it: from_pretrained(…,"
+                    f" tokenizer={brief(named, 200)}), or download that file into the folder as"
+                    f" {TOKENIZER_FILE}."
+                )
+            # it may be added later: its fingerprint is in processor.json
+            Sums(folder).check(TOKENIZER_FILE)
+            tokenizer = inside(folder, TOKENIZER_FILE, "tokenizer")
+        elif tokenizer is None:
+            tokenizer = saved_file(folder, named, "tokenizer")
         stats = config.get("stats")
         if stats is not None:
             stats = saved_file(folder, stats, "statistics")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self
 
-from mme_vla.config.sections import Positive, PositiveInt, Range, read_section
+from mme_vla.config.sections import Positive, PositiveInt, Range, Secret, read_section
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, require
 
@@ -63,7 +63,7 @@ class ServeSettings:
 
     host: str = "127.0.0.1"
     port: Annotated[int, Range(0, 65535)] = 8001
-    api_key: str | None = field(default=None, repr=False)
+    api_key: Secret = field(default=None, repr=False)
     require_key: bool = False
     action_space: (
         Literal["joint_angle", "ee_pose", "waypoint", "ee_delta", "multi_choice"] | None
@@ -93,8 +93,7 @@ class ServeSettings:
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> Self:
         """Read a composed configuration; keys of other purposes are ignored."""
-        # An empty environment variable, as compose files leave it, is no key.
-        return read_section(cls, {**config, "api_key": config.get("api_key") or None}, others=True)
+        return read_section(cls, config, others=True)
 
     def executed(self, robot: Embodiment) -> int:
         """Actions of a chunk that a challenge client gets, and executes."""

@@ -53,7 +53,11 @@ class GraphSampler:
         capacity = 1 << (rows - 1).bit_length()
         key = (capacity, *((tuple(x.shape[1:]), x.dtype) for x in tensors))
         if key not in self._captured:
-            self._captured[key] = self._capture(_map(inputs, lambda x: _filled(x, capacity)))
+            # The last row over and over where there are fewer.
+            full = _map(
+                inputs, lambda x: torch.cat([x, x[-1:].expand(capacity - len(x), *x.shape[1:])])
+            )
+            self._captured[key] = self._capture(full)
         captured = self._captured[key]
         for static, x in zip(_tensors(captured.inputs), tensors, strict=True):
             static[:rows].copy_(x)
@@ -75,11 +79,6 @@ class GraphSampler:
         with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
             chunks = self._run(inputs)
         return _Captured(graph, inputs, chunks)
-
-
-def _filled(x: Tensor, rows: int) -> Tensor:
-    """A copy of so many rows, the last one over and over where there are fewer."""
-    return torch.cat([x, x[-1:].expand(rows - len(x), *x.shape[1:])])
 
 
 def _map(inputs: Inputs, change: Callable[[Tensor], Tensor]) -> Inputs:

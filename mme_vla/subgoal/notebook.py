@@ -95,17 +95,6 @@ def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
     )
 
 
-def monitor_query(goal: str, subgoal: str, clip: bool) -> str:
-    """Return a question to the monitor; its images come before it."""
-    context = "The image shows the scene now."
-    if clip:
-        context = (
-            "The video shows what the robot did since it was given the subgoal, the image the scene"
-            " now."
-        )
-    return f"The task: {goal}\nThe subgoal: {subgoal}\n{context} Is the subgoal complete?"
-
-
 MOST_NOTES = 16
 MOST_STEPS = 32  # of a route
 MOST_WORDS = 200  # characters of a text
@@ -330,7 +319,15 @@ class NotebookPredictor(PromptedPredictor):
         if episode.agreed:
             return True
         images = episode.images()
-        query = monitor_query(episode.goal, subgoal, len(images) > 1)
+        context = "The image shows the scene now."
+        if len(images) > 1:
+            context = (
+                "The video shows what the robot did since it was given the subgoal, the image the"
+                " scene now."
+            )
+        query = (
+            f"The task: {episode.goal}\nThe subgoal: {subgoal}\n{context} Is the subgoal complete?"
+        )
         reply = self.api.ask(MONITOR, [("user", [*images, query])]).text
         replies.append(reply)
         done = json_object(reply).get("done")

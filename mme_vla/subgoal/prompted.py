@@ -47,24 +47,6 @@ def system_prompt(task: str, kind: str) -> str:
     return "\n\n".join(parts)
 
 
-def first_query(goal: str, video: bool) -> str:
-    """Return the first question; its images come before it, the demonstration video first."""
-    context = "The image shows the scene at the start."
-    if video:
-        context = (
-            "The video shows what happened before the robot's turn, the image shows the scene now."
-        )
-    return f"The task: {goal}\n{context} Plan the subgoals, and name the first one."
-
-
-def next_query(clip: bool) -> str:
-    """Return a later question; its video, or one image of a short stretch, comes before it."""
-    context = "This image shows the scene now."
-    if clip:
-        context = "This video shows what the robot did since."
-    return f"{context} Describe what happened, and name the current subgoal."
-
-
 class ConversationEpisode(SubgoalEpisode):
     """An episode, its conversation, and the frames the model has not seen.
 
@@ -84,7 +66,9 @@ class ConversationEpisode(SubgoalEpisode):
         self.unseen += list(frames)
 
     def next_message(self) -> Message:
-        """Return the next question, with all frames that were not shown yet."""
+        """Return the next question, behind all frames that were not shown yet: the demonstration
+        video first, a short stretch as one image.
+        """
         parts: list[str | MediaPart] = []
         frames = self.unseen
         if not self.messages:
@@ -92,13 +76,25 @@ class ConversationEpisode(SubgoalEpisode):
                 parts.append(MediaPart(self.video))
             first_frame = frames[0] if frames else self.frame
             parts.append(MediaPart(first_frame))
-            parts.append(first_query(self.goal, len(self.video) > 0))
+            context = "The image shows the scene at the start."
+            if len(self.video):
+                context = (
+                    "The video shows what happened before the robot's turn, the image shows the"
+                    " scene now."
+                )
+            parts.append(
+                f"The task: {self.goal}\n{context} Plan the subgoals, and name the first one."
+            )
             frames = frames[1:]
         # A first question that failed is followed by the frames since.
         if self.messages or frames:
-            is_clip = len(frames) >= CLIP
-            pixels = np.stack(frames) if is_clip else self.frame
-            parts += [MediaPart(pixels), next_query(is_clip)]
+            pixels = self.frame
+            context = "This image shows the scene now."
+            if len(frames) >= CLIP:
+                pixels = np.stack(frames)
+                context = "This video shows what the robot did since."
+            question = f"{context} Describe what happened, and name the current subgoal."
+            parts += [MediaPart(pixels), question]
         return "user", parts
 
 

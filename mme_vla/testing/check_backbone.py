@@ -25,7 +25,16 @@ def check_backbone(name: str, **sizes: Any) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         backbone = kind(read_section(kind.Config, sizes, "backbone")).eval()
-    batch = _batch(backbone)
+    generator = torch.Generator().manual_seed(0)
+    size = backbone.image_size
+    prompt_mask = torch.tensor([[True] * 6 + [False] * 2, [True] * 8])
+    batch = Batch(
+        images=torch.randint(0, 256, (2, 2, 3, size, size), generator=generator) / 127.5 - 1,
+        image_mask=torch.ones(2, 2, dtype=torch.bool),
+        prompt=torch.randint(1, 16, (2, 8), generator=generator) * prompt_mask,
+        prompt_mask=prompt_mask,
+        actions=torch.randn(2, backbone.horizon, backbone.action_dim, generator=generator),
+    )
     check_tokens(backbone, batch.images)
     print(f"{name}: vision tokens have the right shapes, and do not depend on the batch")
     check_loss(backbone, batch)
@@ -40,18 +49,6 @@ def check_backbone(name: str, **sizes: Any) -> None:
     )
     check_parts(backbone)
     print(f"{name}: finetune_spec covers every parameter, vision and action among them")
-
-
-def _batch(backbone: Backbone) -> Batch:
-    generator, size = torch.Generator().manual_seed(0), backbone.image_size
-    prompt_mask = torch.tensor([[True] * 6 + [False] * 2, [True] * 8])
-    return Batch(
-        images=torch.randint(0, 256, (2, 2, 3, size, size), generator=generator) / 127.5 - 1,
-        image_mask=torch.ones(2, 2, dtype=torch.bool),
-        prompt=torch.randint(1, 16, (2, 8), generator=generator) * prompt_mask,
-        prompt_mask=prompt_mask,
-        actions=torch.randn(2, backbone.horizon, backbone.action_dim, generator=generator),
-    )
 
 
 def _inject(backbone: Backbone, batch: Batch) -> Injection:

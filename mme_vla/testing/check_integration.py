@@ -44,7 +44,11 @@ def check_integration(
         before = _loss(policy, batch, draws, memory_tokens)
         check_reach(policy, batch, draws, memory_tokens, before)
         print(f"{name}: the tokens of {memory} change the loss, their padding does not")
-        check_rows(policy, batch, draws, memory_tokens, before)
+        together, _ = policy(batch, draws, memory=memory_tokens)
+        error = float((together - before.mean()).abs())
+        assert error <= TOLERANCE, (
+            f"samples of one batch see each other: alone their loss differs by {error:.2g}."
+        )
         print(f"{name}: samples of one batch are independent")
         check_sampling(policy, batch, memory_tokens)
         print(f"{name}: sampling agrees with the pass that training makes")
@@ -99,16 +103,6 @@ def check_reach(
     assert (~memory.mask).any(), "the check needs padding among the memory tokens"
     error = float((_loss(policy, batch, draws, padded) - before).abs().max())
     assert error <= TOLERANCE, f"what is in the memory's padding changed the loss by {error:.2g}."
-
-
-def check_rows(
-    policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens, before: Tensor
-) -> None:
-    together, _ = policy(batch, draws, memory=memory)
-    error = float((together - before.mean()).abs())
-    assert error <= TOLERANCE, (
-        f"samples of one batch see each other: alone their loss differs by {error:.2g}."
-    )
 
 
 def check_sampling(policy: MMEPolicy, batch: Batch, memory: MemoryTokens) -> None:

@@ -47,13 +47,9 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
     print(f"{task}: a seed builds one scene, and seed {seed + 1} another")
 
 
-def _make(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> Any:
-    return make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
-
-
 def _scene(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> np.ndarray:
     """Where every object stands after a reset [things, 3]."""
-    env = _make(task, seed, difficulty, options)
+    env = make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
     try:
         env.reset()
         return np.array([thing.position for thing in env.unwrapped.things])
@@ -67,7 +63,7 @@ def _demonstrated(
     from mme_vla.envs.robomme.recording.recorder import demonstrate
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
-    env = _make(task, seed, difficulty, options)
+    env = make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
     try:
         env.reset()
         track: list[np.ndarray] = []

@@ -23,7 +23,7 @@ from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
 from mme_vla.registry import TRAINING_SETS
-from mme_vla.training.settings import CacheSettings, DataSettings
+from mme_vla.training.settings import DataSettings
 from mme_vla.types import labels_read
 from mme_vla.utils import checked_file
 
@@ -65,7 +65,18 @@ def prepare_data(
         encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by
             default asked here.
     """
-    check_changes(policy, data)
+    # Weights and transforms are for some kinds of samples alone.
+    kind = policy.require_processor().samples.kind
+    require(
+        data.weights is None or (policy.loss_weights is not None and kind == "steps"),
+        f"data.weights={data.weights}: {type(policy).__name__} does not weigh samples. Set"
+        " data.weights=null.",
+    )
+    require(
+        not build_transforms(data.history_transforms) or kind == "steps",
+        f"data.history_transforms changes frames, and this policy learns from {kind}: leave it"
+        " empty.",
+    )
     sources = open_sources(data.sources, policy.embodiment)
     val_episodes: Sequence[int | str] | None = data.val_episodes
     if val_episodes is None:
@@ -79,7 +90,21 @@ def prepare_data(
         processor.stats = read_statistics(stats_from, policy, data, sources, split)
     caches = None
     if policy.memory is not None:
-        caches = open_caches(policy, data.cache, sources, cache_command, encoder)
+        # Each dataset's is built first where it is missing and small enough.
+        caches = []
+        for source in sources:
+            cache = ensure_cache(
+                source,
+                policy.memory,
+                policy.encode_frames,
+                encoder or policy.vision_fingerprint(),
+                root=data.cache.root,
+                dtype=str(policy.info.history_dtype).removeprefix("torch."),
+                max_build_frames=data.cache.max_build_frames,
+                batch_size=data.cache.batch_size,
+                command=cache_command,
+            )
+            caches.append(cache)
     train = _samples(policy, data, sources, caches, split.train, seed)
     held_out = sum(map(len, split.val))
     val = None
@@ -92,21 +117,6 @@ def prepare_data(
         f" {counted(0 if val is None else len(val), 'held-out step')} in {held_out}"
     )
     return SplitData(train, val, [source.fingerprint for source in sources])
-
-
-def check_changes(policy: Policy, data: DataSettings) -> None:
-    """Refuse weights and transforms that the policy's kind of samples does not have."""
-    kind = policy.require_processor().samples.kind
-    require(
-        data.weights is None or (policy.loss_weights is not None and kind == "steps"),
-        f"data.weights={data.weights}: {type(policy).__name__} does not weigh samples. Set"
-        " data.weights=null.",
-    )
-    require(
-        not build_transforms(data.history_transforms) or kind == "steps",
-        f"data.history_transforms changes frames, and this policy learns from {kind}: leave it"
-        " empty.",
-    )
 
 
 def compute_statistics(
@@ -172,31 +182,6 @@ def read_statistics(
             f" init_from={folder}, or continue with data.narrow_ranges=warn."
         ) from None
     return stats
-
-
-def open_caches(
-    policy: Policy,
-    settings: CacheSettings,
-    sources: list[EpisodeSource],
-    command: str,
-    encoder: str | None,
-) -> list[Any]:
-    """The vision cache of each dataset, built first where it is missing and small enough."""
-    assert policy.memory is not None
-    return [
-        ensure_cache(
-            source,
-            policy.memory,
-            policy.encode_frames,
-            encoder or policy.vision_fingerprint(),
-            root=settings.root,
-            dtype=str(policy.info.history_dtype).removeprefix("torch."),
-            max_build_frames=settings.max_build_frames,
-            batch_size=settings.batch_size,
-            command=command,
-        )
-        for source in sources
-    ]
 
 
 def _samples(

@@ -298,11 +298,11 @@ class Loggers:
             self._tracker.finish()
 
 
-def check_logger(config: Mapping[str, Any]) -> None:
+def check_logger(section: Mapping[str, Any] | None) -> None:
     """Raise an error, before any long work, if the package of the logger that the section `logger`
     names is missing.
     """
-    name = (config.get("logger") or {}).get("name")
+    name = (section or {}).get("name")
     if name not in ("wandb", "trackio", "mlflow"):
         return
     try:
@@ -317,15 +317,20 @@ def check_logger(config: Mapping[str, Any]) -> None:
     raise UserError(f"logger={name} needs the package {name}: pip install {pins}{name}")
 
 
-def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:
+def open_loggers(
+    folder: Path,
+    config: Mapping[str, Any],
+    first_step: int,
+    section: Mapping[str, Any] | None = None,
+) -> Loggers:
     """Open `metrics.jsonl` and the tracker that the section `logger` names, if any.
 
     A resumed run removes the lines that lie beyond its first step.
     """
     folder.mkdir(parents=True, exist_ok=True)
     tracker = None
-    if section := dict(config.get("logger") or {}):
-        check_logger(config)
+    if section:
+        check_logger(section)
         tracker = LOGGERS.build(section, folder, config, first_step=first_step)
         tracker.start()
         if isinstance(tracker, MLflowTracker):

@@ -88,6 +88,7 @@ class Trainer:
         config: Mapping[str, Any],
         accelerator: Accelerator,
         facts: Mapping[str, Any] | None = None,
+        name: str = "policy",
     ) -> None:
         """Put the policy on its device, and back to where `run.checkpoint` left it.
 
@@ -98,10 +99,12 @@ class Trainer:
             config: the plain configuration, saved with every checkpoint.
             facts: sections that join the policy's own configuration in checkpoints: its training
                 and its card.
+            name: of the policy, for messages.
         """
         self.settings = settings
         self.run_info = run
         self.config = config
+        self.name = name
         self.accelerator = accelerator
         self.validation = validation
         self.facts = dict(facts or {})
@@ -173,7 +176,7 @@ class Trainer:
         if self.accelerator.num_processes > 1:
             device = f"{self.accelerator.num_processes} × {device}"
         return (
-            f"{self.config.get('name', 'policy')}: {total / 1e6:.2f} M parameters,"
+            f"{self.name}: {total / 1e6:.2f} M parameters,"
             f" {trained / 1e6:.2f} M trained, on {device}, in {self.run_info.folder}"
         )
 
@@ -414,7 +417,7 @@ def finish(
         return {}
     summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
     if result is not None:
-        plot_open_loop(result, folder / PLOT, trainer.config["name"])
+        plot_open_loop(result, folder / PLOT, trainer.name)
         loggers.log_image(settings.steps, "open_loop", folder / PLOT)
         summary["open_loop"] = result.summary()
         line.say("\n".join([f"open loop on {result.title}", *error_lines(summary["open_loop"])]))

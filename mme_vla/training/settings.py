@@ -218,7 +218,7 @@ class TrainRun:
         Checkpoints keep it whole.
     """
 
-    name: str
+    name: PathText
     seed: int
     output: PathText
     trainings: PositiveInt
@@ -228,6 +228,8 @@ class TrainRun:
     data: DataSettings
     finetune: FinetuneSettings
     config: Mapping[str, Any]
+    memory: Any = None
+    logger: Mapping[str, Any] | None = None
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -237,12 +239,6 @@ class TrainRun:
             config: plain and resolved.
         """
         settings = TrainSettings.from_dict(config["train"], config["seed"])
-        check_budget(config.get("memory"))
-        run = read_section(
-            cls, config, others=True, name=str(config["name"]), train=settings, config={}
-        )
+        run = read_section(cls, config, others=True, train=settings, config={})
+        check_budget(run.memory)
         return replace(run, config=config)
-
-    def with_keys(self, **changes: Any) -> Self:
-        """The same training with other values of keys of the top level."""
-        return self.from_config({**self.config, **changes})

@@ -54,8 +54,14 @@ class FolderLock:
                 if attempt == _ATTEMPTS - 1:
                     raise
             except Timeout:
+                # What the lock's file says of the process that has it.
+                try:
+                    text = self.path.read_text(errors="replace")[:200].strip()
+                    holder = text or "a process that has just started"
+                except OSError:
+                    holder = "a process that has just ended"
                 raise UserError(
-                    f"{self.folder} is in use by another {self.what} ({self._holder()}). "
+                    f"{self.folder} is in use by another {self.what} ({holder}). "
                     "Wait until it has ended, stop it, or write to another folder."
                 ) from None
             except OSError as error:
@@ -74,14 +80,6 @@ class FolderLock:
             self.path.unlink()
             self.folder.rmdir()
         self._lock.release()
-
-    def _holder(self) -> str:
-        """What the lock's file says of the process that has it."""
-        try:
-            text = self.path.read_text(errors="replace")[:200].strip()
-        except OSError:
-            return "a process that has just ended"
-        return text or "a process that has just started"
 
     def __enter__(self) -> Self:
         return self.acquire()

@@ -170,11 +170,23 @@ def _match_local(
     it has not.
     """
     tensors = merge_state(checkpoint.tensors(), PolicySections.of(checkpoint.config).adapters)
-    _check_tokenizer(policy, checkpoint.folder)
+    # Token ids may mean other words.
+    if policy.processor is not None and (checkpoint.folder / CONFIG_FILE).is_file():
+        prompt = policy.processor.prompt_spec
+        fingerprint = read_settings(checkpoint.folder).get("tokenizer_fingerprint")
+        require(
+            None in (fingerprint, prompt.fingerprint) or fingerprint == prompt.fingerprint,
+            f"{checkpoint.folder} was trained with another tokenizer ({brief(fingerprint)}) than"
+            f" {prompt.encoder!r} ({prompt.fingerprint}): its ids would mean other words. Set"
+            " processor.tokenizer to that one.",
+        )
     state = policy.state_dict()
     left = []
+    components = policy.finetune_spec.components.items()
     for name in sorted(set(tensors) - set(state)):
-        if _OF_MEMORY.search(name) or _part(policy, name) == "memory":
+        # The component that another's parameter would belong to, if any.
+        component = next((part for part, pattern in components if re.match(pattern, name)), None)
+        if _OF_MEMORY.search(name) or component == "memory":
             left.append(name)
             del tensors[name]
     shapes = {name: tuple(tensor.shape) for name, tensor in state.items()}
@@ -220,31 +232,6 @@ def _match_foreign(
     tensors = checkpoint.tensors(check_names)
     reduced, named, left = split(tensors)
     return reduced.translate(named, state, source), left
-
-
-def _part(policy: Policy, name: str) -> str | None:
-    """The part of a policy that another's parameter would belong to; None where it has
-    none such.
-    """
-    for part, pattern in policy.finetune_spec.components.items():
-        if re.match(pattern, name):
-            return part
-    return None
-
-
-def _check_tokenizer(policy: Policy, folder: Path) -> None:
-    """Refuse a start from weights whose token ids mean other words."""
-    if policy.processor is None or not (folder / CONFIG_FILE).is_file():
-        return
-    prompt = policy.processor.prompt_spec
-    fingerprint = read_settings(folder).get("tokenizer_fingerprint")
-    if fingerprint is None or prompt.fingerprint is None or fingerprint == prompt.fingerprint:
-        return
-    raise UserError(
-        f"{folder} was trained with another tokenizer ({brief(fingerprint)}) than"
-        f" {prompt.encoder!r} ({prompt.fingerprint}): its ids would mean other words. Set"
-        " processor.tokenizer to that one."
-    )
 
 
 def _reduced(

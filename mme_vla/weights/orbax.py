@@ -145,7 +145,13 @@ def read_orbax(
         if fits is not None:
             fits(shapes)
         reads = {name: store.read() for name, store in stores.items()}
-        tree = {name: _to_tensor(read.result()) for name, read in reads.items()}
+        tree = {}
+        for name, read in reads.items():
+            array = np.array(read.result())
+            if array.dtype.name == "bfloat16":  # which numpy knows only through an extension
+                tree[name] = torch.from_numpy(array.view(np.uint16)).view(torch.bfloat16)
+            else:
+                tree[name] = torch.from_numpy(array)
     require(tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
 
@@ -199,7 +205,14 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
     arrays: dict[str, np.ndarray] = {}
     for name, tensor in sorted(tree.items()):
         path = ("params", *name.split("/"), "value")
-        arrays[".".join(path)] = _to_numpy(tensor)
+        values = tensor.detach().cpu().contiguous()
+        if values.dtype == torch.bfloat16:
+            import ml_dtypes  # comes with tensorstore
+
+            array = values.view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
+        else:
+            array = values.numpy()
+        arrays[".".join(path)] = array
         leaves[str(path)] = {
             "key_metadata": [{"key": key, "key_type": _DICT_KEY} for key in path],
             "value_metadata": {"value_type": "np.ndarray", "skip_deserialize": False},
@@ -269,21 +282,6 @@ def _store(params: Path | Zipped, path: str, ocdbt: bool) -> dict[str, Any]:
     if ocdbt:
         return {"driver": "ocdbt", "base": f"file://{place}/", "path": within}
     return {"driver": "file", "path": f"{place}/{path}/"}
-
-
-def _to_tensor(array: np.ndarray) -> Tensor:
-    if array.dtype.name == "bfloat16":  # which numpy knows only through an extension
-        return torch.from_numpy(np.array(array).view(np.uint16)).view(torch.bfloat16)
-    return torch.from_numpy(np.array(array))
-
-
-def _to_numpy(tensor: Tensor) -> np.ndarray:
-    tensor = tensor.detach().cpu().contiguous()
-    if tensor.dtype == torch.bfloat16:
-        import ml_dtypes  # comes with tensorstore
-
-        return tensor.view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
-    return tensor.numpy()
 
 
 def _tensorstore() -> Any:

@@ -100,22 +100,6 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
     return renamed
 
 
-def window_of(policy: Policy) -> dict[str, bool | int]:
-    """What LeRobot's settings of its short-window memory would be for a policy; all off for one
-    that has none.
-    """
-    memory = policy.memory
-    if not isinstance(memory, SpaceTime):
-        return dict.fromkeys(WINDOW_MEMORY, False)
-    settings: dict[str, bool | int] = {
-        "use_visual_memory": memory.past_view_spec is not None,
-        "use_proprioceptive_memory": memory.states is not None,
-    }
-    for source_name, (target_name, _) in WINDOW.items():
-        settings[source_name] = getattr(memory, target_name)
-    return settings
-
-
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
     """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's."""
     has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
@@ -128,7 +112,14 @@ def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None
             " unset. To begin training from it use start_from() (on the command line:"
             " init_from=…)."
         )
-    expected = window_of(policy)
+    # What LeRobot's settings would be for this policy; all off where it has no such memory.
+    memory = policy.memory
+    expected: dict[str, Any] = dict.fromkeys(WINDOW_MEMORY, False)
+    if isinstance(memory, SpaceTime):
+        expected["use_visual_memory"] = memory.past_view_spec is not None
+        expected["use_proprioceptive_memory"] = memory.states is not None
+        for source_name, (target_name, _) in WINDOW.items():
+            expected[source_name] = getattr(memory, target_name)
     is_equal = all(expected.get(setting) == value for setting, value in has.items())
     is_mutual = getattr(getattr(policy, "integration", None), "mutual", False)
     if not is_equal or (has["use_proprioceptive_memory"] and not is_mutual):

@@ -303,9 +303,16 @@ def _of_archive(file: Path) -> Source:
 
 
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
+    from safetensors import safe_open
+
     names = []
     for file in files:
-        names += _names(file)
+        check_header(file)
+        with (
+            decoding(file, "a safetensors file", "Download or copy it again."),
+            safe_open(file, "pt") as opened,
+        ):
+            names += list(opened.keys())
     if is_port(names):
         if "type" in Source("lerobot", folder).config:
             return Source("lerobot", folder, files)
@@ -338,14 +345,3 @@ def _of_torch_file(path: Path) -> Source:
         f"{path} holds no policy known here: its tensors are called {few}. Known:"
         f" {', '.join(native_formats())}."
     )
-
-
-def _names(file: Path) -> list[str]:
-    from safetensors import safe_open
-
-    check_header(file)
-    with (
-        decoding(file, "a safetensors file", "Download or copy it again."),
-        safe_open(file, "pt") as opened,
-    ):
-        return list(opened.keys())

@@ -34,7 +34,12 @@ from mme_vla.serving.client import Client
 from mme_vla.serving.codec import pack
 from mme_vla.serving.remote.connections import HarnessConnection, HttpConnection, _encode
 from mme_vla.serving.remote.policy import RemotePolicy, _identity, _RefusedError, json_value
-from mme_vla.serving.remote.protocols import HarnessProtocol, LibraryProtocol, NewFrames
+from mme_vla.serving.remote.protocols import (
+    HarnessProtocol,
+    LibraryProtocol,
+    NewFrames,
+    ServerMetadata,
+)
 from mme_vla.serving.remote.settings import ConnectionSettings, ServerChoice
 
 BRIEF = ConnectionSettings(timeout_s=1, open_s=2)
@@ -627,14 +632,14 @@ def test_an_array_in_place_of_a_text_is_a_malformed_reply(field: str) -> None:
 def test_metadata_of_another_kind_are_refused_or_left_out() -> None:
     choice = ServerChoice("ws://h:1", "mme_vla")
     harness = HarnessProtocol(choice, ROBOMME_JOINT)
-    harness.describe({"observation_params": ARRAY})
-    harness.describe({"observation_params": {"send_subgoal": ARRAY}})
+    harness.describe(ServerMetadata.of({"observation_params": ARRAY}))
+    harness.describe(ServerMetadata.of({"observation_params": {"send_subgoal": ARRAY}}))
     assert harness.subgoal is None
     params = {"send_subgoal": True, "subgoal_mode": "x" * 999}
     with pytest.raises(UserError, match="none of simple_subgoal, grounded_subgoal"):
-        harness.describe({"observation_params": params})
+        harness.describe(ServerMetadata.of({"observation_params": params}))
     with pytest.raises(UserError, match="is no server of this library"):
-        LibraryProtocol(choice, ROBOMME_JOINT).describe({"server": ARRAY})
+        LibraryProtocol(choice, ROBOMME_JOINT).describe(ServerMetadata.of({"server": ARRAY}))
 
 
 def test_lists_of_several_lengths_are_a_malformed_action() -> None:
@@ -660,7 +665,7 @@ def test_lists_of_several_lengths_are_a_malformed_action() -> None:
 @pytest.mark.parametrize("name", ["../../elsewhere", "/etc", "..", "a/b", "x" * 101])
 @pytest.mark.parametrize("key", ["model", "checkpoint"])
 def test_a_servers_names_lead_out_of_no_folder(key: str, name: str) -> None:
-    metadata = {"identity": {"model": "m", "checkpoint": 3} | {key: name}}
+    metadata = ServerMetadata.of({"identity": {"model": "m", "checkpoint": 3} | {key: name}})
     choice = ServerChoice("ws://h:1")
     with pytest.raises(UserError, match=r"cannot name a folder"):
         _identity(choice, "mme_vla", metadata)

@@ -263,7 +263,7 @@ def log_twice(folder: Path, section: dict[str, Any]) -> None:
     folder.mkdir(parents=True)
     Image.new("RGB", (4, 4)).save(folder / "p.png")
     for step in (3, 4):
-        opened = open_loggers(folder, {"logger": section}, step - 1)
+        opened = open_loggers(folder, {}, step - 1, section)
         opened.write(step, {"train/loss": 0.5})
         opened.log_image(step, "plot", folder / "p.png")
         opened.close()
@@ -318,7 +318,7 @@ def test_metrics_beyond_the_resumed_step_are_cut_off(tmp_path: Path) -> None:
 def test_missing_logger_package_is_reported(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(__import__("sys").modules, name, None)
     with pytest.raises(UserError, match=f"logger={name} needs the .* `?{name}"):
-        check_logger({"logger": {"name": name}})
+        check_logger({"name": name})
 
 
 def test_loss_change_compares_both_ends() -> None:

@@ -19,7 +19,7 @@ from mme_vla.extras.audit.conclusion import (
     INTERVENTIONS,
     Conclusion,
     conclude,
-    scenes_for,
+    resolution,
 )
 from mme_vla.extras.audit.floor import RANDOM, RandomPolicy
 from mme_vla.extras.probing.arms import UNPROBED, slug
@@ -106,7 +106,12 @@ def run_audit(
     references = dict(references or {})
     notes = []
     if RANDOM not in references:
-        why = _no_floor(policy, recordings)
+        # What the random floor needs and lacks.
+        why = None
+        if policy.embodiment.readings:
+            why = NEEDS["stream"]
+        elif not policy.embodiment.action.choice and not recordings:
+            why = NEEDS["recordings"]
         if why is None:
             _run_floor(policy, plan, folder / RANDOM, facts, settings, options)
             references[RANDOM] = str(folder / RANDOM)
@@ -117,16 +122,6 @@ def run_audit(
     conclusion = conclude(card, audit.resolve)
     _write(card, conclusion, folder, policy)
     return Audit(card, conclusion, folder / PAGE)
-
-
-def _no_floor(policy: Policy, recordings: Sequence[Recording]) -> str | None:
-    """What the random floor needs and lacks, for a message; None where it can be measured."""
-    robot = policy.embodiment
-    if robot.readings:
-        return NEEDS["stream"]
-    if not robot.action.choice and not recordings:
-        return NEEDS["recordings"]
-    return None
 
 
 def _run_floor(
@@ -148,7 +143,10 @@ def _run_floor(
 
 def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:
     """How many scenes of each task the stated difference needs."""
-    return math.ceil(scenes_for(audit.resolve) / max(n_tasks, 1))
+    scenes = 4
+    while resolution(scenes) > audit.resolve and scenes < 512:
+        scenes += 1
+    return math.ceil(scenes / max(n_tasks, 1))
 
 
 def _affordable_scenes(

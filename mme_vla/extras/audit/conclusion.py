@@ -6,7 +6,7 @@ from functools import cache
 from mme_vla.errors import counted
 from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.extras.audit.floor import RANDOM
-from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, Loss, grade, percent
+from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, grade, percent
 
 FORGET = "nothing remembered"
 NO_VIDEO = "no video"
@@ -80,14 +80,6 @@ def resolution(scenes: int) -> float:
     return float("inf")
 
 
-def scenes_for(loss: float) -> int:
-    """How many scenes it takes to tell such a loss from none."""
-    scenes = 4
-    while resolution(scenes) > loss and scenes < 512:
-        scenes += 1
-    return scenes
-
-
 def conclude(card: Card, target_loss: float) -> Conclusion:
     """The conclusion of a card whose interventions are `INTERVENTIONS`.
 
@@ -97,8 +89,13 @@ def conclude(card: Card, target_loss: float) -> Conclusion:
     finest = max(resolution(card.scenes), card.noise)
     sentences = [VERDICTS[verdict]]
     for label in (FORGET, NO_VIDEO, CONTENT, TIME, REPLAY, LAST, GOAL):
-        if label in card.arms and card.arms[label].beyond_noise:
-            sentences.append(f"With {label} it solves {_change(card, card.arms[label])}.")
+        if _loses(card, label):
+            loss = card.arms[label]
+            sentences.append(
+                f"With {label} it solves {percent(loss.success)} instead of"
+                f" {percent(card.matched)} (loss {percent(loss.loss)}, 95 % interval"
+                f" {percent(loss.low)} to {percent(loss.high)})."
+            )
     if verdict == "content" and _loses(card, TIME):
         sentences.append("It finds what it needs by time: shifted frames mislead it too.")
     if card.references and RANDOM in card.references:
@@ -136,10 +133,3 @@ def _verdict(card: Card) -> str:
 
 def _loses(card: Card, label: str) -> bool:
     return label in card.arms and card.arms[label].beyond_noise
-
-
-def _change(card: Card, loss: Loss) -> str:
-    return (
-        f"{percent(loss.success)} instead of {percent(card.matched)} (loss {percent(loss.loss)},"
-        f" 95 % interval {percent(loss.low)} to {percent(loss.high)})"
-    )

@@ -134,9 +134,10 @@ class GoalProcessor(PolicyProcessor):
             settings.pop("name", None) == cls.name,
             f"{folder} holds a processor of another kind of policy.",
         )
-        text, stats = settings.get("text"), settings.pop("stats", None)
+        stats = settings.pop("stats", None)
+        text = settings.pop("text", None)
         if tokenizer is not None:
-            settings["text"] = str(tokenizer)
+            text = str(tokenizer)
         elif text not in cls.trusted:
             raise UserError(
                 f"{folder} takes its text tower from {brief(text, 200)}, which is not read on a"
@@ -144,9 +145,8 @@ class GoalProcessor(PolicyProcessor):
                 f" tokenizer={brief(text, 200)})."
             )
         try:
-            options: dict[str, Any] = {
-                "embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))
-            }
+            robot = Embodiment.from_dict(settings.pop("embodiment", {}))
+            options: dict[str, Any] = {"text": text, "embodiment": robot}
             if stats is not None:
                 require(isinstance(stats, str), f"stats={brief(stats)} must be the name of a file.")
                 options["stats"] = NormStats.load(checked_file(folder, stats, "statistics"))

@@ -119,12 +119,26 @@ class Prismatic(nn.Module):
         vocab_size: int,
         dino_standard: Standard = OPENVLA,
     ) -> None:
+        import transformers
+
         super().__init__()
         # The towers come first: with one seed they are the same in every variant, and so is a cache
         # made by them.
         self.vision = FusedVision(vision, dino_standard)
         self.projector = Projector(vision.width, llama.width)
-        self.language = _llama(llama, vocab_size)
+        sizes: Any = transformers.LlamaConfig(  # type: ignore[call-arg]
+            vocab_size=vocab_size,
+            hidden_size=llama.width,
+            intermediate_size=llama.mlp_dim,
+            num_hidden_layers=llama.depth,
+            num_attention_heads=llama.num_heads,
+            num_key_value_heads=llama.num_heads,
+            rms_norm_eps=llama.norm_eps,
+            max_position_embeddings=MAX_POSITIONS,
+            tie_word_embeddings=False,
+        )
+        sizes._attn_implementation = "sdpa"
+        self.language: Any = transformers.LlamaForCausalLM(sizes)
         self.language.model.rotary_emb = Angles(llama.width // llama.num_heads)
 
     def encode_images(self, images: Tensor) -> Tensor:
@@ -193,21 +207,3 @@ class Angles(nn.Module):
         """
         rope = rotation(position_ids, self.head_dim)
         return rope.cos.squeeze(2).to(x.dtype), rope.sin.squeeze(2).to(x.dtype)
-
-
-def _llama(config: LlamaConfig, vocab_size: int) -> Any:
-    import transformers
-
-    sizes: Any = transformers.LlamaConfig(  # type: ignore[call-arg]
-        vocab_size=vocab_size,
-        hidden_size=config.width,
-        intermediate_size=config.mlp_dim,
-        num_hidden_layers=config.depth,
-        num_attention_heads=config.num_heads,
-        num_key_value_heads=config.num_heads,
-        rms_norm_eps=config.norm_eps,
-        max_position_embeddings=MAX_POSITIONS,
-        tie_word_embeddings=False,
-    )
-    sizes._attn_implementation = "sdpa"
-    return transformers.LlamaForCausalLM(sizes)

@@ -91,7 +91,8 @@ class Training:
     """One training of a row.
 
     row: what the page calls it.
-    config: as `compose_policy` gives it, with the training's own seed.
+    seed: the training's own, as in `config`.
+    config: as `compose_policy` gives it.
     settings, learning: the sections `train` and `learning`.
     folder: of the run.
     files: demonstrations; one in `HELD_OUT` only measures.
@@ -100,6 +101,7 @@ class Training:
     """
 
     row: str
+    seed: int
     config: Mapping[str, Any]
     settings: Mapping[str, Any]
     learning: Mapping[str, Any]
@@ -109,14 +111,9 @@ class Training:
     tower_seed: int = 0
 
     @property
-    def seed(self) -> int:
-        """The training's own."""
-        return int(self.config["seed"])
-
-    @property
     def content(self) -> list[str]:
         """Digests of the demonstrations."""
-        acts = Embodiment.from_dict(self.config["embodiment"]).action
+        acts = Embodiment.from_dict(PolicySections.of(self.config).embodiment).action
         return list(content_of(tuple(self.files), tuple(acts.choice)))
 
     @property
@@ -230,6 +227,7 @@ def train(job: Training) -> Path:
                 TRAINING: identify(full_config, content),
                 "card": card,
             },
+            name=str(PolicySections.of(full_config).name),
         )
         line = ProgressLine(train_settings.steps, run.step)
         loggers = open_loggers(folder, {}, run.step)

@@ -72,6 +72,17 @@ class Trained:
 
 
 @dataclass(frozen=True)
+class _Limits:
+    """Settings of `run.json` that are rules of the board: of an evaluation `max_actions`, of a run
+    of `play` `max_choices`.
+    """
+
+    max_actions: int | None = None
+    max_choices: int | None = None
+    only_possible: bool = False
+
+
+@dataclass(frozen=True)
 class Training:
     """One training and its episodes, numbered from 0 within each task.
 
@@ -133,8 +144,22 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
         if training.is_local and name in names:
             name = f"{name} (yours)"
         row = rows.setdefault(name, [])
+        # Trainings of a row are of one recipe, and none is another one. Their digests of the data
+        # may differ: demonstrations recorded on another processor end otherwise here and there.
         for earlier in row:
-            _check_alike(earlier, training)
+            both = f"{earlier.folder} and {training.folder}"
+            first, second = earlier.facts, training.facts
+            for fact in ("kind", "recipe", "demonstrations", "budget"):
+                values = getattr(first, fact), getattr(second, fact)
+                require(
+                    values[0] == values[1],
+                    f"{both} are trainings of the row {first.row}, but {fact} is {values[0]} and"
+                    f" {values[1]}. Give them different names of rows.",
+                )
+            require(
+                first.seed != second.seed and first.weights != second.weights,
+                f"{both} have the same seed or weights: they are one training.",
+            )
         row.append(training)
         require(
             training.rules == trainings[0].rules,
@@ -201,10 +226,10 @@ def read_training(folder: Path) -> Training:
     counts = Counter(record.key for record in records)
     twice = [f"{key.task} {key.episode}" for key, count in counts.items() if count > 1]
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
-    settings = run["settings"]
-    max_choices = settings.get("max_actions", settings.get("max_choices"))
-    only_possible = settings.get("only_possible", False)
-    rules = rules_text(records[0].action_space, max_choices, only_possible)
+    where = f"{folder / RUN_FILE}: settings"
+    limits = read_section(_Limits, run["settings"], where, others=True)
+    max_choices = limits.max_choices if limits.max_actions is None else limits.max_actions
+    rules = rules_text(records[0].action_space, max_choices, limits.only_possible)
     return Training(folder, facts, _numbered(folder, records), rules)
 
 
@@ -288,23 +313,3 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
         f" lacks {listed(missing) or 'none'}, and has {listed(others) or 'none'} beside them.",
     )
     return numbered
-
-
-def _check_alike(first: Training, other: Training) -> None:
-    """Make sure that two trainings of a row are of one recipe, and not the same one.
-
-    Their digests of the data may differ: demonstrations recorded on another processor end otherwise
-    here and there.
-    """
-    for name in ("kind", "recipe", "demonstrations", "budget"):
-        value = getattr(first.facts, name)
-        other_value = getattr(other.facts, name)
-        require(
-            value == other_value,
-            f"{first.folder} and {other.folder} are trainings of the row {first.facts.row}, but"
-            f" {name} is {value} and {other_value}. Give them different names of rows.",
-        )
-    require(
-        first.facts.seed != other.facts.seed and first.facts.weights != other.facts.weights,
-        f"{first.folder} and {other.folder} have the same seed or weights: they are one training.",
-    )

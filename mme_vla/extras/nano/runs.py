@@ -178,6 +178,7 @@ def trainings_of(
         for seed in range(nano.seed, nano.seed + trainings):
             job = Training(
                 row,
+                seed,
                 {**each, "seed": seed},
                 nano.train,
                 nano.learning,

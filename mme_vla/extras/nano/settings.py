@@ -77,7 +77,7 @@ class NanoRun:
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read a composed configuration, plain and resolved."""
         run = read_section(cls, config, others=True, config={})
-        read_section(LearningSettings, config["learning"], "learning")
+        read_section(LearningSettings, run.learning, "learning")
         # Episodes are chosen after hours of recording and training: make sure now that they exist.
         amounts = [run.episodes]
         if run.also and run.also_episodes is not None:
@@ -88,7 +88,7 @@ class NanoRun:
                 f"episodes={episodes}: with replace=true write how many scenes of each task.",
             )
             choose_episodes(run.task, episodes, run.split)
-        return replace(run, train=config["train"], learning=config["learning"], config=config)
+        return replace(run, config=config)
 
     @property
     def budgets(self) -> tuple[int | None, ...]:

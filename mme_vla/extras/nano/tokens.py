@@ -57,7 +57,7 @@ class FrameTokens:
 
     def save(self, path: Path, stamp: str) -> None:
         """Write one file, which appears whole or not at all. stamp: of the demonstration
-        (`stamp_of`).
+        (see `TokenStore.make`).
         """
         from safetensors.torch import save_file
 
@@ -141,17 +141,6 @@ def _scores(memory: "Memory", images: Mapping[int, np.ndarray]) -> FrameScores:
     return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
 
 
-def stamp_of(file: Path) -> str:
-    """Twelve letters that name a demonstration's content and which of its frames are rendered."""
-    content = hashlib.sha256()
-    with np.load(file) as stored:
-        for name in stored:
-            if not name.endswith("_pictures"):
-                content.update(name.encode())
-                content.update(np.ascontiguousarray(stored[name]).tobytes())
-    return content.hexdigest()[:12]
-
-
 @dataclass(frozen=True)
 class TokenStore:
     """The tokens of demonstrations by one tower, a file each, in a folder that is named after the
@@ -196,7 +185,14 @@ class TokenStore:
         """Encode a demonstration unless its tokens are there, of all its frames and with every
         score.
         """
-        stamp = stamp_of(file)
+        # The stamp names the demonstration's content and which of its frames are rendered.
+        content = hashlib.sha256()
+        with np.load(file) as stored:
+            for name in stored:
+                if not name.endswith("_pictures"):
+                    content.update(name.encode())
+                    content.update(np.ascontiguousarray(stored[name]).tobytes())
+        stamp = content.hexdigest()[:12]
         if not self._is_made(file, stamp):
             scored = map(_memory, self.memories)
             tokenize(_policy(self.config), Demonstration.load(file), scored).save(

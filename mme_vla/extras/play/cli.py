@@ -17,7 +17,6 @@ from mme_vla.config.composition import resolved
 from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, Range, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
-from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError, counted, require
 from mme_vla.evaluation.records import EpisodeRecord
@@ -127,7 +126,7 @@ def _choose_player(
         )
         from mme_vla.extras.play.policy_player import load_player  # PyTorch
 
-        player, facts, decisive = load_player(cfg, settings.max_steps)
+        player, facts, decisive = load_player(cfg, settings.max_steps, settings.max_choices)
         model, checkpoint, seed = player.model, facts.checkpoint, command.seed
         folder = Path("outputs", "play", model, str(checkpoint))
         for name in ("memory_budget", "composition", "training"):
@@ -156,32 +155,30 @@ def _choose_player(
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:
+    """Play and record the episodes; what breaks in one ends it with an error, but not the run."""
     todo = list(run.todo)
     log.info("%d episodes to play, %d played before", len(todo), len(run.episodes) - len(todo))
     for number, which in enumerate(todo, 1):
-        log.info("%d/%d %s", number, len(todo), line(_play_one(run, which, player)))
-
-
-def _play_one(run: PlayRun, which: EpisodeSpec, player: Any) -> EpisodeRecord:
-    """Play and record one episode; what breaks in it ends it with an error, but not the run."""
-    session: ChoiceSession | None = None
-    try:
-        session = run.make(which)
-        play(session, player)
-        return run.save(session, **player.notes())
-    except UserError:  # the next episode would only meet it again
-        raise
-    except Exception as error:
-        log.warning("%s, episode %d broke", which.task, which.episode, exc_info=True)
-        # A player that has not begun still has the notes of the episode before.
-        notes = player.notes() if session is not None and session.reveals else {}
-        return run.save_error(which, f"{type(error).__name__}: {error}", session, **notes)
-    finally:
-        if session is not None:
-            try:
-                session.close()
-            except Exception:  # after a crash there may be nothing left to close
-                log.warning("the simulator could not be closed", exc_info=True)
+        session: ChoiceSession | None = None
+        try:
+            session = run.make(which)
+            play(session, player)
+            record = run.save(session, **player.notes())
+        except UserError:  # the next episode would only meet it again
+            raise
+        except Exception as error:
+            log.warning("%s, episode %d broke", which.task, which.episode, exc_info=True)
+            # A player that has not begun still has the notes of the episode before.
+            notes = player.notes() if session is not None and session.reveals else {}
+            reason = f"{type(error).__name__}: {error}"
+            record = run.save_error(which, reason, session, **notes)
+        finally:
+            if session is not None:
+                try:
+                    session.close()
+                except Exception:  # after a crash there may be nothing left to close
+                    log.warning("the simulator could not be closed", exc_info=True)
+        log.info("%d/%d %s", number, len(todo), line(record))
 
 
 def line(record: EpisodeRecord) -> str:

@@ -7,7 +7,7 @@ import logging
 import struct
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -170,11 +170,14 @@ class Desk:
         return state
 
     def frames(self, session_id: str, number: int) -> bytes:
-        """The frames of one reveal, see `pack_frames`.
+        """The frames of one reveal, as JPEGs behind a table: their number and each one's size in
+        bytes, all uint32 in little-endian order.
 
         Raises:
             StaleError: another episode is on, or it has no such reveal.
         """
+        from PIL import Image
+
         session = self.session
         if (
             session is None
@@ -182,7 +185,14 @@ class Desk:
             or not 0 <= number < len(session.reveals)
         ):
             raise StaleError("There are no such frames: another episode is on.")
-        return pack_frames(session.reveals[number].frames)
+        images = []
+        for frame in session.reveals[number].frames:
+            buffer = io.BytesIO()
+            image = Image.fromarray(np.asarray(frame))
+            image.save(buffer, "JPEG", quality=QUALITY, subsampling=0)
+            images.append(buffer.getvalue())
+        table = struct.pack(f"<{len(images) + 1}I", len(images), *map(len, images))
+        return table + b"".join(images)
 
     def close(self) -> None:
         """Wait for a motion that is under way, and free the simulator."""
@@ -244,17 +254,3 @@ class Desk:
     def _enter(self, phase: str, error: str = "") -> None:
         self.error, self._since = error, time.monotonic()
         self.phase = phase  # last: who sees the phase sees what belongs to it
-
-
-def pack_frames(frames: Sequence[np.ndarray]) -> bytes:
-    """Frames as JPEGs behind a table: their number and each one's size in bytes, all uint32 in
-    little-endian order.
-    """
-    from PIL import Image
-
-    images = []
-    for frame in frames:
-        buffer = io.BytesIO()
-        Image.fromarray(np.asarray(frame)).save(buffer, "JPEG", quality=QUALITY, subsampling=0)
-        images.append(buffer.getvalue())
-    return struct.pack(f"<{len(images) + 1}I", len(images), *map(len, images)) + b"".join(images)

@@ -103,7 +103,9 @@ class PolicyPlayer(Player):
             self._running.episode.close()
 
 
-def load_player(cfg: DictConfig, max_steps: int) -> tuple[PolicyPlayer, RunFacts, dict[str, Any]]:
+def load_player(
+    cfg: DictConfig, max_steps: int, max_choices: int | None
+) -> tuple[PolicyPlayer, RunFacts, dict[str, Any]]:
     """The policy of `checkpoint=…` or `server=…` as a player, what its records say of it, and what
     decides its choices.
     """
@@ -117,9 +119,9 @@ def load_player(cfg: DictConfig, max_steps: int) -> tuple[PolicyPlayer, RunFacts
             f"{name} acts by {robot.action.answers or robot.name}, and play offers choices"
             f" ({CHOICES}): evaluate it on the same episodes, mme-vla evaluate … video=all.",
         )
-        environment(config["env"]).check_embodiment(robot)
-        limits = {"max_steps": max_steps, "max_actions": config["max_choices"]}
+        limits = {"max_steps": max_steps, "max_actions": max_choices}
         settings = RolloutSettings.from_config({**config, **limits})
+        environment(settings.env).check_embodiment(robot)
         choose_subgoals(policy, None)  # none is given here, of which a policy that reads them warns
         facts = facts_of(policy, name, place, settings, None)
         safe_name(facts.model, "the policy's name")  # it names a folder

@@ -92,14 +92,6 @@ def following(decision: Decision, options: Sequence[Option], changed: bool) -> s
     )
 
 
-def retry_message(reason: str) -> str:
-    """The message after a reply that cannot be used."""
-    return (
-        f"Your last answer could not be used: {reason}. Answer again, ending with one JSON object "
-        '{"choice": "<letter>", "point": [row, column] or null}.'
-    )
-
-
 def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
     """Read a reply: the last JSON object in it, whatever stands before.
 
@@ -176,7 +168,10 @@ class ModelPlayer(Player):
                 action = parse_choice(reply, session.options)
             except MalformedReply as error:
                 self.usage.problems["malformed" if reply.strip() else "empty"] += 1
-                complaint = retry_message(str(error))
+                complaint = (
+                    f"Your last answer could not be used: {error}. Answer again, ending with one"
+                    ' JSON object {"choice": "<letter>", "point": [row, column] or null}.'
+                )
             else:
                 return action, {"answers": replies}
         raise NoChoiceError(

@@ -114,32 +114,26 @@ class _Moments:
         self._baseline: dict[int, Tensor] = {}  # Unprobed chunks [draws, h, w] of each step
 
     def lines(self) -> list[Line]:
-        """All lines."""
-        result: list[Line] = []
-        for probed in self._by_feed.values():
-            result += self._watch(probed)
-        return result
-
-    def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
-        """Run the episode once for arms with the same feed."""
+        """All lines: the episode runs once for all arms with the same feed."""
         result: list[Line] = []
         recording = self._recording
-        episode = arms[0].start_episode(recording.goal, self._seed)
-        episode.recording = recording
-        required = self._required_frames(arms)
-        n_observed = 0
-        for step in self._steps:
-            recording.show(episode, n_observed, step + 1, required)
-            n_observed = step + 1
-            episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
-            if self._subgoal_kind is not None:
-                episode.subgoal = recording.subgoal(step, self._subgoal_kind)
-            episode.subgoals.append(episode.subgoal)
-            for probed in arms:
-                result += self._probe(probed, episode, step)
-            episode.inner.subgoal = episode.subgoal
-            # banks are written where chunks are chosen
-            self._policy.act([episode.inner], self._settings.flow_steps)
+        for arms in self._by_feed.values():
+            episode = arms[0].start_episode(recording.goal, self._seed)
+            episode.recording = recording
+            required = self._required_frames(arms)
+            n_observed = 0
+            for step in self._steps:
+                recording.show(episode, n_observed, step + 1, required)
+                n_observed = step + 1
+                episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
+                if self._subgoal_kind is not None:
+                    episode.subgoal = recording.subgoal(step, self._subgoal_kind)
+                episode.subgoals.append(episode.subgoal)
+                for probed in arms:
+                    result += self._probe(probed, episode, step)
+                episode.inner.subgoal = episode.subgoal
+                # banks are written where chunks are chosen
+                self._policy.act([episode.inner], self._settings.flow_steps)
         return result
 
     def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:

@@ -320,7 +320,10 @@ class ProbedPolicy(Policy):
         self.sessions = list(sessions)[: self.feed.n_sessions]
         self.n_before = sum(recording.length for recording in self.sessions)
         """Frames of the sessions."""
-        self.memory, self.processor, self.config = inner.memory, inner.processor, dict(inner.config)
+        self.memory = inner.memory
+        self.processor = inner.processor
+        arm_config = {"probe": [arm.name, options_of(arm)]} if arm.parts else {}
+        self.config = {**inner.config, **arm_config}
         self.horizon = inner.horizon
         # Episodes of a stress split's sessions count (`with_sessions`), those of an arm do not.
         self.info = PolicyInfo(
@@ -331,8 +334,6 @@ class ProbedPolicy(Policy):
             server=inner.info.server,
             history_dtype=inner.info.history_dtype,
         )
-        if arm.parts:
-            self.config["probe"] = [arm.name, options_of(arm)]
 
     def start_episode(self, goal: str, seed: int = 0) -> ProbedEpisode:
         return ProbedEpisode(self, goal, seed)
@@ -526,7 +527,11 @@ def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
     count = 0 if variant is None else variant.sessions
     if not count:
         return policy
-    episodes = _recorded_episodes(policy, recordings)
+    episodes: list[Recording] = []
+    if isinstance(recordings, Sequence) and all(isinstance(one, Recording) for one in recordings):
+        episodes = list(recordings)
+    elif recordings is not None:
+        episodes = all_recordings(open_sources(recordings, policy.embodiment))
     if policy.embodiment.readings or count > len(episodes):
         raise UserError(
             f"split={split} needs {count} recorded episodes to take from, and there are"
@@ -534,14 +539,6 @@ def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
         )
     probed = ProbedPolicy(policy, read_arm(f"distract:{count}"), episodes).eval()
     probed.info = replace(probed.info, n_distractor_episodes=count)
-    probed.config["sessions"] = [recording.name for recording in probed.sessions]
+    names = [recording.name for recording in probed.sessions]
+    probed.config = {**probed.config, "sessions": names}
     return probed
-
-
-def _recorded_episodes(policy: Policy, recordings: Any) -> list[Recording]:
-    """The recorded episodes of datasets; recorded episodes as they are, and none for None."""
-    if recordings is None:
-        return []
-    if isinstance(recordings, Sequence) and all(isinstance(one, Recording) for one in recordings):
-        return list(recordings)
-    return all_recordings(open_sources(recordings, policy.embodiment))

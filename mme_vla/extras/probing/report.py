@@ -125,7 +125,13 @@ def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
         return name
     words = [text.split() for text in texts]
     if len({len(of_one) for of_one in words}) > 1:
-        return f"{name}: {texts[0]}" if len(texts) == 1 else f"{name}: {_common_start(words)}"
+        # Texts of several lengths: what all of them begin with.
+        beginning = []
+        for column in zip(*words, strict=False):
+            if len(set(column)) > 1:
+                break
+            beginning.append(column[0])
+        return f"{name}: {' '.join([*beginning, '…'])}"
     shared: list[str] = []
     for column in zip(*words, strict=True):
         different = sorted(set(column))
@@ -133,15 +139,6 @@ def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
         if word != "…" or shared[-1:] != ["…"]:
             shared.append(word)
     return f"{name}: {' '.join(shared)}"
-
-
-def _common_start(texts: Sequence[Sequence[str]]) -> str:
-    shared = []
-    for column in zip(*texts, strict=False):
-        if len(set(column)) > 1:
-            break
-        shared.append(column[0])
-    return " ".join([*shared, "…"])
 
 
 def checkpoints_table(findings: dict[str, Findings]) -> Table:

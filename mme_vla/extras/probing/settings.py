@@ -86,7 +86,21 @@ class ProbeChoice:
         `with` and datasets exist.
         """
         if self.twins:
-            self._check_twins()
+            without_effect = {
+                "card": self.card,
+                "online": self.online,
+                "recordings": self.recordings,
+                "with": self.arms,
+                "event": self.event,
+                "server": self.server,
+                "references": self.references,
+            }
+            for key, value in without_effect.items():
+                require(
+                    not value,
+                    "twins=true measures the policy as it is and without memory: leave out"
+                    f" {key}=….",
+                )
             return
         require(
             self.offline or self.in_closed_loop,
@@ -114,26 +128,7 @@ class ProbeChoice:
         if self.recordings is None:
             return
         for entry in listed_sources(self.recordings):
-            root = entry if isinstance(entry, str) else entry.get("root")
-            if isinstance(root, str) and root:
-                resolve_root(root)
-
-    def _check_twins(self) -> None:
-        """Refuse what has no effect on twins."""
-        without_effect = {
-            "card": self.card,
-            "online": self.online,
-            "recordings": self.recordings,
-            "with": self.arms,
-            "event": self.event,
-            "server": self.server,
-            "references": self.references,
-        }
-        for key, value in without_effect.items():
-            require(
-                not value,
-                f"twins=true measures the policy as it is and without memory: leave out {key}=….",
-            )
+            resolve_root(entry.root)
 
 
 def check_probe(config: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ them, and `integration.mutual=true` of `context` puts them there. Frames of the 
 are past frames as any other.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -111,7 +111,19 @@ class SpaceTime(MemoryModule):
     def gather_selection(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> HistoryTokens:
-        rows = MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime")
+        def proprio(frames: np.ndarray) -> Tensor:
+            """The robot's states of frames [n]; zeros where none are read."""
+            if self.states is None:
+                return torch.zeros(len(frames), self.d_vision)
+            states = history.proprio(frames)
+            if states.shape[1] > self.state_dim:
+                raise UserError(
+                    f"memory.state_dim={self.state_dim}: a state of this robot has"
+                    f" {states.shape[1]} numbers."
+                )
+            return states
+
+        rows = MotionRows(history, proprio, self.d_vision, "spacetime")
         return super().gather_selection(rows, step, rng)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
@@ -123,21 +135,3 @@ class SpaceTime(MemoryModule):
         tokens = self.states(history.features[..., : self.state_dim].to(weight))
         ages = None if history.ages is None else history.ages.to(weight.device)
         return MemoryTokens(tokens, history.mask.to(weight.device), ages=ages)
-
-    def _proprio_rows(self, history: History) -> Callable[[np.ndarray], Tensor]:
-        """A function from frames [n] to the robot's states, at most as wide as their layer; zeros
-        where no states are read.
-        """
-
-        def rows(frames: np.ndarray) -> Tensor:
-            if self.states is None:
-                return torch.zeros(len(frames), self.d_vision)
-            proprio = history.proprio(frames)
-            if proprio.shape[1] > self.state_dim:
-                raise UserError(
-                    f"memory.state_dim={self.state_dim}: a state of this robot has"
-                    f" {proprio.shape[1]} numbers."
-                )
-            return proprio
-
-        return rows

@@ -32,6 +32,7 @@ from mme_vla.serving.remote.protocols import (
     LONGEST_CHUNK,
     PROTOCOLS,
     NewFrames,
+    ServerMetadata,
     ServerProtocol,
     count_of,
     detect,
@@ -244,7 +245,8 @@ class RemotePolicy(Policy):
             ) from None
         self.metadata = first.metadata
         first.close()
-        self.protocol.describe(self.metadata)
+        metadata = ServerMetadata.of(self.metadata)
+        self.protocol.describe(metadata)
 
         robot = self.protocol.robot
         self.memory = None
@@ -260,16 +262,16 @@ class RemotePolicy(Policy):
         if running is None and self.protocol.shares_memory:
             running = 1
         if running is None and name == "mme_vla":
-            running = count_of(self.metadata, "max_clients")
-        identity = _identity(choice, name, self.metadata)
+            running = count_of(metadata.max_clients)
+        identity = _identity(choice, name, metadata)
         self._server: dict[str, Any] = {
             "address": choice.server,
             "protocol": name,
             "metadata": json_value(self.metadata),
         }
         self.info = PolicyInfo(
-            sample_steps=count_of(self.metadata, "sample_steps") or 1,
-            max_actions=count_of(self.metadata, "max_actions"),
+            sample_steps=count_of(metadata.sample_steps) or 1,
+            max_actions=count_of(metadata.max_actions),
             resamples=False,
             max_running=running,
             identity=identity,
@@ -316,7 +318,10 @@ class RemotePolicy(Policy):
             steps is None,
             "flow_steps=…: a server chooses its own; leave it out, or set it where it is started.",
         )
-        remote = [_remote(episode) for episode in episodes]
+        remote: list[RemoteEpisode] = []
+        for episode in episodes:
+            assert isinstance(episode, RemoteEpisode)
+            remote.append(episode)
         futures = [self._threads.submit(self._request, episode) for episode in remote]
         try:
             wait(futures)
@@ -430,7 +435,19 @@ class RemotePolicy(Policy):
         length = len(actions)
         with self._lock:
             if self._chunk_length is None:
-                self._check_length(length)
+                # The length of the first chunk, beside what the rollout executes of it.
+                server = self.protocol.choice.server
+                require(
+                    self._execute is None or self._execute <= length,
+                    f"execute={self._execute}: {server} returns {length} actions a chunk. Set"
+                    f" execute to {length} or less, or have the server return more.",
+                )
+                executed = self._execute or self.embodiment.action.execute
+                require(
+                    executed >= length or not self.protocol.executes_all,
+                    f"{server} returns {length} actions a chunk, and the challenge executes all of"
+                    f" them: set execute={length}.",
+                )
                 self._chunk_length = length
         if length != self._chunk_length:
             raise _RefusedError(
@@ -439,37 +456,17 @@ class RemotePolicy(Policy):
             )
         return np.ascontiguousarray(actions, np.float32)
 
-    def _check_length(self, length: int) -> None:
-        """Compare the length of the first chunk with what the rollout executes of it."""
-        require(
-            self._execute is None or self._execute <= length,
-            f"execute={self._execute}: {self.protocol.choice.server} returns {length} actions a"
-            f" chunk. Set execute to {length} or less, or have the server return more.",
-        )
-        if self.protocol.executes_all:
-            executed = self._execute or self.embodiment.action.execute
-            require(
-                executed >= length,
-                f"{self.protocol.choice.server} returns {length} actions a chunk, and the"
-                f" challenge executes all of them: set execute={length}.",
-            )
-
 
 class _RefusedError(Exception):
     """The server refuses a request, or its reply cannot be read: another try would end alike."""
 
 
-def _remote(episode: Episode) -> RemoteEpisode:
-    assert isinstance(episode, RemoteEpisode)
-    return episode
-
-
-def _identity(choice: ServerChoice, protocol: str, metadata: Mapping[str, Any]) -> PolicyIdentity:
+def _identity(choice: ServerChoice, protocol: str, metadata: ServerMetadata) -> PolicyIdentity:
     """What records call a served policy: what the command says, else the server, else the
     protocol.
     """
     connection = choice.connection
-    described = metadata.get("identity") if protocol == "mme_vla" else None
+    described = metadata.identity if protocol == "mme_vla" else None
     if isinstance(described, Mapping):
         identity = read_section(PolicyIdentity, described, "the server's identity")
         # These name folders of this machine.

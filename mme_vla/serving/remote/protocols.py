@@ -12,10 +12,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
+from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS
 from mme_vla.errors import UserError, brief, listed, require
@@ -32,6 +33,30 @@ from mme_vla.serving.requests import IMAGE_KEYS
 
 SERVER_NAME = "mme_vla"  # what this library's server calls itself
 LONGEST_CHUNK = 4096  # actions
+
+
+@dataclass(frozen=True)
+class ServerMetadata:
+    """What a server says of itself. The keys are those of this library's servers, and
+    `observation_params` of the harness; on another server one may mean anything.
+    """
+
+    server: Any = None
+    version: Any = None
+    robot: Any = None
+    horizon: Any = None
+    execute: Any = None
+    subgoal: Any = None
+    identity: Any = None
+    observation_params: Any = None
+    sample_steps: Any = None
+    max_actions: Any = None
+    max_clients: Any = None
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, Any]) -> Self:
+        """Read the metadata that a connection got."""
+        return read_section(cls, metadata, "the server's metadata", others=True)
 
 
 @dataclass
@@ -107,7 +132,7 @@ class ServerProtocol:
             self.choice.server, connection.api_key, connection.timeout_s, connection.open_s
         )
 
-    def describe(self, metadata: Mapping[str, Any]) -> None:
+    def describe(self, metadata: ServerMetadata) -> None:
         """Take what the server says of itself."""
 
     def begin(self, connection: Connection, frames: NewFrames) -> None:
@@ -153,23 +178,23 @@ class LibraryProtocol(ServerProtocol):
     def check(self) -> None:
         """Every robot has a place."""
 
-    def describe(self, metadata: Mapping[str, Any]) -> None:
+    def describe(self, metadata: ServerMetadata) -> None:
         require(
-            str(metadata.get("server")) == SERVER_NAME,
+            metadata.server == SERVER_NAME,
             f"protocol=mme_vla: {self.choice.server} is no server of this library; set"
             " protocol=auto.",
         )
         require(
-            "robot" in metadata,
-            f"{self.choice.server} is a server of version {brief(metadata.get('version'))}, which"
+            metadata.robot is not None,
+            f"{self.choice.server} is a server of version {brief(metadata.version)}, which"
             " describes no robot: update it, or set protocol=challenge.",
         )
-        robot = Embodiment.from_dict(metadata["robot"])
+        robot = Embodiment.from_dict(metadata.robot)
         robot = robot.with_horizon(_actions_of(metadata, "horizon"))
         action = replace(robot.action, execute=_actions_of(metadata, "execute"))
         self.robot = replace(robot, action=action)
-        kind = metadata.get("subgoal")
-        self.subgoal = self.subgoal if kind is None else _subgoal_kind(str(kind))
+        if metadata.subgoal is not None:
+            self.subgoal = _subgoal_kind(str(metadata.subgoal))
 
     def begin(self, connection: Connection, frames: NewFrames) -> None:
         connection.request({"reset": True, "seed": frames.seed})
@@ -282,8 +307,8 @@ class HarnessProtocol(ServerProtocol):
             self.choice.server, connection.api_key, connection.timeout_s, connection.open_s
         )
 
-    def describe(self, metadata: Mapping[str, Any]) -> None:
-        params = metadata.get("observation_params")
+    def describe(self, metadata: ServerMetadata) -> None:
+        params = metadata.observation_params
         if isinstance(params, Mapping) and params.get("send_subgoal") is True:
             kind = params.get("subgoal_mode", "grounded")
             self.subgoal = self.subgoal or _subgoal_kind(f"{kind}_subgoal")
@@ -371,7 +396,7 @@ def detect(choice: ServerChoice) -> Detection:
         HarnessConnection(*address, connection.open_s).close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
-        if str(client.metadata.get("server")) == SERVER_NAME:
+        if ServerMetadata.of(client.metadata).server == SERVER_NAME:
             return Detection("mme_vla", "its metadata say so")
         try:
             reply = client.request({"reset": True})
@@ -406,20 +431,20 @@ def _subgoal_kind(text: str) -> str:
     return text
 
 
-def count_of(metadata: Mapping[str, Any], key: str) -> int | None:
+def count_of(value: Any) -> int | None:
     """A whole number from 1 on of a server's metadata; None where it gives none."""
-    value = metadata.get(key)
     if isinstance(value, int) and not isinstance(value, bool) and value >= 1:
         return value
     return None
 
 
-def _actions_of(metadata: Mapping[str, Any], key: str) -> int:
+def _actions_of(metadata: ServerMetadata, key: Literal["horizon", "execute"]) -> int:
     """A number of actions, which the metadata must have."""
-    count = count_of(metadata, key)
+    value = getattr(metadata, key)
+    count = count_of(value)
     require(
         count is not None and count <= LONGEST_CHUNK,
-        f"The server's metadata are malformed: {key}={brief(metadata.get(key))} must be a whole"
+        f"The server's metadata are malformed: {key}={brief(value)} must be a whole"
         f" number from 1 to {LONGEST_CHUNK}.",
     )
     assert count is not None

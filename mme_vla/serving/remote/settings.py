@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 from urllib.parse import urlsplit
 
-from mme_vla.config.sections import PathText, Positive, PositiveInt, read_section
+from mme_vla.config.sections import PathText, Positive, PositiveInt, Secret, read_section
 from mme_vla.errors import require
 
 Subgoals = Literal["simple", "grounded"]
@@ -17,7 +17,7 @@ class ConnectionSettings:
 
     name: str | None = None
     checkpoint: PathText | None = None
-    api_key: PathText | None = field(default=None, repr=False)
+    api_key: Secret = field(default=None, repr=False)
     timeout_s: Positive = 600
     open_s: Positive = 60
     episodes: PositiveInt | None = None
@@ -67,10 +67,7 @@ class ServerChoice:
         """Read the keys of a command; None where it names no server."""
         if config.get("server") is None:
             return None
-        # An empty environment variable, as compose files leave it, is no key.
-        connection = dict(config.get("connection") or {})
-        connection["api_key"] = connection.get("api_key") or None
-        return read_section(cls, {**config, "connection": connection}, others=True)
+        return read_section(cls, config, others=True)
 
 
 def _is_address(text: str) -> bool:

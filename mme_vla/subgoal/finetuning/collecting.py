@@ -228,7 +228,13 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
             f"{source.root} has no column {' and no '.join(missing)}: nothing to learn subgoals"
             " from."
         )
-    task_names = {} if tasks is None else _read_tasks(tasks)
+    task_names: dict[str, str] = {}
+    if tasks is not None:
+        form = '{"<episode index>": "<Task>", …}'
+        task_names = read_json(tasks, f"tasks=<file> of {form}", kind=(dict, list))
+        is_mapping = isinstance(task_names, dict)
+        if not is_mapping or not all(isinstance(name, str) for name in task_names.values()):
+            raise UserError(f"tasks={tasks} must hold {form}.")
     demonstrations = []
     for e in range(len(source)):
         task = task_names.get(str(e)) or source.task(e)
@@ -251,15 +257,6 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
         read_images = partial(_lerobot_images, source, e)
         demonstrations.append(Demonstration(task, number, origin, labels, read_images))
     return demonstrations
-
-
-def _read_tasks(path: Path) -> dict[str, str]:
-    tasks: dict[str, str] = read_json(
-        path, 'tasks=<file> of {"<episode index>": "<Task>", …}', kind=(dict, list)
-    )
-    if not isinstance(tasks, dict) or not all(isinstance(task, str) for task in tasks.values()):
-        raise UserError(f'tasks={path} must hold {{"<episode index>": "<Task>", …}}.')
-    return tasks
 
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:

@@ -109,7 +109,12 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
             ]
         }
         if kind == "grounded":
-            boxes = [_perturb(point, options.noise, rng) for point in points]
+            boxes = [list(point) for point in points]
+            if options.noise is not None:
+                least, most = options.noise
+                for number, point in enumerate(points):
+                    moved = np.array(point) + rng.integers(least, most + 1, 2)
+                    boxes[number] = np.clip(moved, 0, SIDE - 1).tolist()
             row["objects"] = {"ref": [], "bbox": boxes}
         row["images"] = names
         if video:
@@ -145,13 +150,6 @@ def _memer(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
         )
         texts = (MEMER_SYSTEM, user, memer_reply(subtask, window.positions))
         yield texts, points, [*window.past, *window.frames]
-
-
-def _perturb(point: Point, noise: tuple[int, int] | None, rng: np.random.Generator) -> list[int]:
-    if noise is None:
-        return list(point)
-    shift = rng.integers(noise[0], noise[1] + 1, 2)
-    return np.clip(np.array(point) + shift, 0, SIDE - 1).tolist()
 
 
 IGNORED = -100  # a label that does not count

@@ -196,7 +196,15 @@ class Api:
 
     def _request(self, system: str, messages: Sequence[Message]) -> Reply:
         settings = self.settings
-        client = self._connect()
+        with self._lock:
+            if self._client is None:
+                try:
+                    self._client = make_client(settings)
+                except UserError as error:
+                    raise UserError(
+                        f"{error} (The cache {settings.cache} lacks this answer.)"
+                    ) from None
+            client = self._client
         request: dict[str, Any] = {
             "model": settings.model,
             "messages": chat_messages(system, messages, settings.video_frames),
@@ -227,17 +235,6 @@ class Api:
             self.usage.input_tokens += input_tokens
             self.usage.output_tokens += output_tokens
         return Reply(self._text(response), input_tokens, output_tokens)
-
-    def _connect(self) -> Any:
-        with self._lock:
-            if self._client is None:
-                try:
-                    self._client = make_client(self.settings)
-                except UserError as error:
-                    raise UserError(
-                        f"{error} (The cache {self.settings.cache} lacks this answer.)"
-                    ) from None
-            return self._client
 
     def _text(self, response: Any) -> str:
         """Return the text of a response, which may be of any form."""

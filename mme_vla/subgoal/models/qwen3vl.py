@@ -81,7 +81,13 @@ class VLM:
         self.model = model
         self.processor = processor
         self.batch_size = batch_size
-        limit_images(processor)
+        # The released limits of images and videos; they resize nothing of 256×256 pixels.
+        area = TOKEN_SIDE**2
+        least = 4 * area
+        most = VIDEO_FRAMES * VIDEO_TOKENS * area
+        image_size = {"shortest_edge": least, "longest_edge": IMAGE_TOKENS * area}
+        processor.image_processor.size = image_size
+        processor.video_processor.size = {"shortest_edge": least, "longest_edge": most}
 
     @classmethod
     def load(
@@ -200,12 +206,3 @@ def _check_batch(size: int) -> None:
         isinstance(size, int) and size >= 1,
         f"batch_size={size!r} must be a whole number, 1 or more.",
     )
-
-
-def limit_images(processor: Any) -> None:
-    """Set the released limits of images and videos; they resize nothing of 256×256 pixels."""
-    area = TOKEN_SIDE**2
-    least = 4 * area
-    most = VIDEO_FRAMES * VIDEO_TOKENS * area
-    processor.image_processor.size = {"shortest_edge": least, "longest_edge": IMAGE_TOKENS * area}
-    processor.video_processor.size = {"shortest_edge": least, "longest_edge": most}

@@ -39,10 +39,16 @@ class ReplyCache:
             return None
         try:
             stored = verified(read_json(path, "a stored reply"), str(path))
-            return _reply_of(stored, path)
+            # A model's text may hold half characters, which no section of a configuration may.
+            text = stored.get("text")
+            counts: list[Any] = [stored.get(key) for key in ("input_tokens", "output_tokens")]
+            are_counts = all(type(count) is int and 0 <= count < MOST_TOKENS for count in counts)
+            if not isinstance(text, str) or not are_counts:
+                raise UserError(f"{path} lacks a text and two numbers of tokens.")
         except UserError as error:
             log.warning("%s The question is asked again.", error)
             return None
+        return Reply(text, *counts)
 
     def write(self, digest: str, reply: Reply) -> None:
         path = self.path(digest)
@@ -51,19 +57,3 @@ class ReplyCache:
                 draft.write_text(json.dumps(with_checksum(asdict(reply))))
         except OSError as error:  # such as a full disk: the reply is used all the same
             log.warning("%s cannot be written: %s", path, error.strerror)
-
-
-def _reply_of(stored: dict[str, Any], path: Path) -> Reply:
-    """The reply that a file holds, beside other keys.
-
-    A model's text may hold half characters, which no section of a configuration may.
-    """
-    text = stored.get("text")
-    counts: list[int] = []
-    for key in ("input_tokens", "output_tokens"):
-        count = stored.get(key)
-        if type(count) is int and 0 <= count < MOST_TOKENS:
-            counts.append(count)
-    if not isinstance(text, str) or len(counts) != 2:
-        raise UserError(f"{path} lacks a text and two numbers of tokens.")
-    return Reply(text, *counts)

@@ -108,17 +108,6 @@ class DitConfig:
         check_choice("backbone.head.perceptual_init", self.perceptual_init, INITS)
 
 
-def step_features(steps: Tensor) -> Tensor:
-    """[cos(t f) | sin(t f)] of diffusion steps [n], f_j = 10000^(−j/half): [n, TIME_FEATURES]
-    float32.
-    """
-    ramp = torch.arange(TIME_FEATURES // 2, device=steps.device, dtype=torch.float32) / (
-        TIME_FEATURES // 2
-    )
-    angles = steps.float()[:, None] * 10_000.0**-ramp
-    return torch.cat([angles.cos(), angles.sin()], -1)
-
-
 class DitBlock(nn.Module):
     """Self-attention over the chunk, attention to the perceptual tokens, an MLP; norms
     before each.
@@ -195,7 +184,11 @@ class Dit(nn.Module):
         """
         if drop is not None:
             cognition = torch.where(drop[:, None, None], self.nothing, cognition)
-        time = step_features(steps).to(self.time_in.weight.dtype)
+        # [cos(t f) | sin(t f)], f_j = 10000^(−j/half): [b, TIME_FEATURES].
+        half = TIME_FEATURES // 2
+        ramp = torch.arange(half, device=steps.device, dtype=torch.float32) / half
+        angles = steps.float()[:, None] * 10_000.0**-ramp
+        time = torch.cat([angles.cos(), angles.sin()], -1).to(self.time_in.weight.dtype)
         time = self.time_out(nn.functional.silu(self.time_in(time)))
         first = time[:, None] + self.cognition(cognition)
         return torch.cat([first, self.action(x)], 1) + self.positions

@@ -5,32 +5,22 @@ them.
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mme_vla.extras.methods.memoryvla.bank import BankState
-from mme_vla.extras.methods.memoryvla.model import BankStates, MemoryVlaCore
+from mme_vla.extras.methods.memoryvla.model import BankStates
 from mme_vla.extras.methods.writable_memory import MemoryEntries
-from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.episode import Episode
 from mme_vla.types import FrameBatch
 
+if TYPE_CHECKING:
+    from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
+
 VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
-
-
-class Writer(Host, Protocol):
-    """What such an episode asks of its policy besides."""
-
-    @property
-    def banked(self) -> MemoryVlaCore: ...
-
-    def write(
-        self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]
-    ) -> BankStates: ...
-
-    def store(self, banks: BankStates, cognition: Tensor, features: Tensor) -> BankStates: ...
 
 
 class MemoryVlaEpisode(Episode):
@@ -41,7 +31,7 @@ class MemoryVlaEpisode(Episode):
     one frame gives the same chunk.
     """
 
-    def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
+    def __init__(self, policy: "MemoryVlaPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self._writer = policy
         self._banks = policy.banked.init_state()

@@ -294,15 +294,6 @@ class MemoryVlaCore(Core):
         )
 
 
-def build_core(config: MemoryVlaConfig, recalls: bool) -> Core:
-    """A fresh core that recalls through a memory, or has banks of its own."""
-    if recalls:
-        return RecallingCore(config)
-    cognition = EpisodeBank(config.vlm.width, **vars(config.bank))
-    perceptual = EpisodeBank(config.perceptual_width, **vars(config.bank))
-    return MemoryVlaCore(config, cognition, perceptual)
-
-
 def cognition_token(hidden: Tensor, patches: int, words: Tensor) -> Tensor:
     """The state that means the moment: of the last word, behind the images' tokens.
 

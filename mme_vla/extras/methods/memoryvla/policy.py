@@ -15,13 +15,14 @@ from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.backbone.building import shapes_only
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, require
+from mme_vla.extras.methods.memoryvla.bank import EpisodeBank
 from mme_vla.extras.methods.memoryvla.episode import MemoryVlaEpisode
 from mme_vla.extras.methods.memoryvla.model import (
     BankStates,
     Core,
     MemoryVlaConfig,
     MemoryVlaCore,
-    build_core,
+    RecallingCore,
     read_moments,
 )
 from mme_vla.extras.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
@@ -136,7 +137,13 @@ class MemoryVlaPolicy(NetworkPolicy):
         if not fresh_backbone:
             vlm.to_empty(device=torch.get_default_device())
         # Drawn in any case: OpenVLA, to start from, has none.
-        core = build_core(sizes, recalls=bool(sections.memory))
+        core: Core
+        if sections.memory:
+            core = RecallingCore(sizes)
+        else:
+            cognition = EpisodeBank(sizes.vlm.width, **vars(sizes.bank))
+            perceptual = EpisodeBank(sizes.perceptual_width, **vars(sizes.bank))
+            core = MemoryVlaCore(sizes, cognition, perceptual)
         memory: Memory | None = None
         if sections.memory:
             memory = build_memory(

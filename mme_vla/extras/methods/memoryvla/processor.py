@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.config.sections import without
+from mme_vla.config.sections import PositiveInt, read_section, without
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import check_integer, require
+from mme_vla.errors import require
 from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig
 from mme_vla.extras.methods.openvla_oft.processor import ClippedQuantiles, OpenVlaProcessor
 from mme_vla.memory.base import stack_history
@@ -64,6 +64,13 @@ class GroupBatch(TensorStruct):
 GROUP_SIZE = 16
 
 
+@dataclass(frozen=True)
+class MemoryVlaProcessorSettings:
+    """Settings of a `MemoryVlaProcessor` beside those of `OpenVlaProcessor`."""
+
+    group_size: PositiveInt = GROUP_SIZE
+
+
 @PROCESSORS.register("memoryvla")
 class MemoryVlaProcessor(OpenVlaProcessor):
     """As OpenVLA's, but for the prompt's end, the numbers that are commanded as −1 or 1, and
@@ -75,10 +82,10 @@ class MemoryVlaProcessor(OpenVlaProcessor):
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
-        size = config.get("group_size", GROUP_SIZE)
-        check_integer("processor.group_size", size)
+        settings = read_section(MemoryVlaProcessorSettings, config, "processor", others=True)
         built = super().from_config(without(config, "group_size"))
-        built.samples = SampleSpec(group_size=size, cameras=(built.embodiment.memory_camera,))
+        camera = built.embodiment.memory_camera
+        built.samples = SampleSpec(group_size=settings.group_size, cameras=(camera,))
         return built
 
     @classmethod

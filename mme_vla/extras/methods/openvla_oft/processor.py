@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.config.sections import without
-from mme_vla.errors import brief, require
+from mme_vla.config.sections import read_section, without
+from mme_vla.errors import require
 from mme_vla.processing.base import Sample, SampleSpec, StatsSpec
 from mme_vla.processing.images import as_uint8_frames, hsv_to_rgb, rgb_to_hsv
 from mme_vla.processing.processor import Processor
@@ -237,6 +237,13 @@ def shift_hue(pixels: Tensor, by: Tensor) -> Tensor:
     return hsv_to_rgb((hue + by.squeeze(-1)) % 1, saturation, value)[:, 0]
 
 
+@dataclass(frozen=True)
+class OpenVlaProcessorSettings:
+    """Settings of an `OpenVlaProcessor` beside those of `Processor`."""
+
+    jpeg: bool = False
+
+
 @PROCESSORS.register("openvla")
 class OpenVlaProcessor(Processor):
     """Lanczos-3 images, Llama's words, clipped quantiles of raw numbers, and the state for the
@@ -253,15 +260,14 @@ class OpenVlaProcessor(Processor):
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """As `Processor.from_config`, with `jpeg` beside the other settings."""
-        jpeg = config.get("jpeg", False)
-        require(isinstance(jpeg, bool), f"processor.jpeg must be true or false, not {brief(jpeg)}.")
+        settings = read_section(OpenVlaProcessorSettings, config, "processor", others=True)
         built = super().from_config(without(config, "name", "jpeg"))
         require(
             built.embodiment.action.width == built.action_dim,
             f"backbone.action_dim={built.action_dim}: this network's actions are as wide as the"
             f" robot's, {built.embodiment.action.width}.",
         )
-        built.jpeg = jpeg
+        built.jpeg = settings.jpeg
         return built
 
     # Images

@@ -5,13 +5,15 @@ head and state token in `.pt` files beside them, and statistics in `dataset_stat
 import json
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.config.sections import PositiveInt, read_section
+from mme_vla.errors import UserError, listed, require
 from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.extras.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.policy.base import Policy
@@ -73,10 +75,7 @@ def named_base(folder: Path) -> str | None:
     """
     if not (folder / FOLDER / FILE).is_file():
         return None
-    name = _settings(folder).get("base_model_name_or_path")
-    if isinstance(name, str) and name:
-        return name
-    return "its base model"
+    return _settings(folder).base_model_name_or_path or "its base model"
 
 
 def merge_run(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
@@ -92,13 +91,9 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     rank)·B·A.
     """
     settings, file = _settings(folder), folder / FOLDER / FILE
-    rank, alpha = settings.get("r"), settings.get("lora_alpha")
-    require(
-        isinstance(rank, int) and isinstance(alpha, int | float) and rank >= 1,
-        f"{folder / FOLDER / SETTINGS} has r={brief(rank)}, lora_alpha={brief(alpha)}: no LoRA's.",
-    )
+    rank, alpha = settings.r, settings.lora_alpha
     unread = ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern")
-    if other := [name for name in unread if settings.get(name)]:
+    if other := [name for name in unread if getattr(settings, name)]:
         raise UserError(
             f"{folder / FOLDER / SETTINGS} sets {listed(other)}, which are not read: merge it with"
             " peft."
@@ -132,10 +127,23 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     return out
 
 
-def _settings(folder: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _AdapterSettings:
+    """Keys of `adapter_config.json`, as peft writes it."""
+
+    r: PositiveInt
+    lora_alpha: float
+    base_model_name_or_path: str | None = None
+    use_dora: Any = None
+    use_rslora: Any = None
+    rank_pattern: Any = None
+    alpha_pattern: Any = None
+
+
+def _settings(folder: Path) -> _AdapterSettings:
     place = checked_file(folder, f"{FOLDER}/{SETTINGS}", "adapters")
-    settings: dict[str, Any] = read_json(place, "a LoRA's settings", limit=2**20)
-    return settings
+    section = read_json(place, "a LoRA's settings", limit=2**20)
+    return read_section(_AdapterSettings, section, str(place), others=True)
 
 
 STATISTICS = "dataset_statistics.json"

@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
@@ -15,18 +15,19 @@ from mme_vla.extras.methods.sam2act.geometry import (
     Cube,
     PointFinder,
     angles_of_bins,
-    zoom_back,
 )
 from mme_vla.extras.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.extras.methods.sam2act.processor import (
-    SAM2ActProcessor,
     Shot,
     cloud_images,
     zoomed_images,
 )
 from mme_vla.extras.methods.sam2act.sam2 import BankState
 from mme_vla.extras.methods.writable_memory import MemoryEntries
-from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.episode import Episode
+
+if TYPE_CHECKING:
+    from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def decide(
     bins = torch.stack([outputs[axis].argmax(-1) for axis in "xyz"], -1)
     angles = torch.deg2rad(angles_of_bins(bins, network.sizes.rotation_bins)).float()
     grip = 2.0 * outputs["gripper"].argmax(-1, keepdim=True) - 1
-    position = cube.back(zoom_back(point, first, ZOOM))
+    position = cube.back(point / ZOOM + first)  # in the coordinates of the first look
     waypoint = torch.cat([position, angles, grip], -1)[0].float()
     return waypoint, remembered
 
@@ -98,17 +99,6 @@ def watch(
     return network.coarse_step(views, remembered)[1]
 
 
-class Watcher(Host, Protocol):
-    """What this episode asks of its policy besides."""
-
-    @property
-    def most_remembered(self) -> int: ...
-
-    def require_processor(self) -> SAM2ActProcessor: ...
-
-    def watch(self, scene: SceneInputs, remembered: BankState) -> BankState: ...
-
-
 class KeyframeEpisode(Episode):
     """Goal, bank and current shots of one episode.
 
@@ -117,9 +107,9 @@ class KeyframeEpisode(Episode):
     first execution frame is there.
     """
 
-    _policy: Watcher
+    _policy: "SAM2ActPolicy"
 
-    def __init__(self, policy: Watcher, goal: str, seed: int = 0) -> None:
+    def __init__(self, policy: "SAM2ActPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self.remembered = BankState()
         """What was kept of all keyframes before the current one."""
@@ -160,7 +150,14 @@ class KeyframeEpisode(Episode):
             if demo[at]:
                 self._video.append((processor.shots(frames, i), float(fingers[at])))
         if len(demo) and not demo[-1]:
-            self._store_video()
+            # The video is over: some of its moments, spread evenly, are remembered.
+            count = min(len(self._video), processor.video_frames)
+            indices = np.linspace(0, len(self._video) - 1, count).round().astype(int)
+            for place, index in enumerate(indices):
+                shots, finger = self._video[index]
+                scene = self._scene_inputs(shots, finger, place)
+                self.remembered = self._policy.watch(scene, self.remembered)
+            self._video = []
             if self._after is not None:
                 self.remembered, self._after = self._after, None
                 self.waypoints += 1
@@ -207,16 +204,6 @@ class KeyframeEpisode(Episode):
         assert isinstance(twin, KeyframeEpisode) and twin.awaiting is not None
         newest = twin.awaiting.maps[-1]  # the others are not what this episode saw
         self.decided(BankState((*self.remembered.maps, newest)[-self._policy.most_remembered :]))
-
-    def _store_video(self) -> None:
-        most = self._policy.require_processor().video_frames
-        count = min(len(self._video), most)
-        indices = np.linspace(0, len(self._video) - 1, count).round().astype(int)
-        for place, index in enumerate(indices):
-            shots, finger = self._video[index]
-            scene = self._scene_inputs(shots, finger, place)
-            self.remembered = self._policy.watch(scene, self.remembered)
-        self._video = []
 
     def _scene_inputs(self, shots: list[Shot], finger: float, place: int) -> SceneInputs:
         processor = self._policy.require_processor()

@@ -70,11 +70,6 @@ class Cube:
         return (low + high) / 2, (high - low).max() / 2
 
 
-def zoom_back(point: Tensor, centre: Tensor, factor: float = ZOOM) -> Tensor:
-    """One point [b, 3] of a closer look, in the coordinates of the first."""
-    return point / factor + centre
-
-
 def shift_and_rotate(points: Tensor, centre: Tensor, shift: Tensor, angle: Tensor) -> Tensor:
     """Points [b, n, 3] turned about the vertical through a centre and moved.
 
@@ -354,13 +349,6 @@ def splat(images: Tensor, depth: Tensor, radius: float = RADIUS) -> tuple[Tensor
     return covered, torch.where(best.isinf(), EMPTY, best)
 
 
-def centred(depth: Tensor) -> Tensor:
-    """Depths [v, side, side] less the mean of each view's filled pixels; empty ones stay."""
-    filled = depth >= 0
-    mean = torch.where(filled, depth, 0).sum((-2, -1)) / filled.sum((-2, -1)).clamp(min=1)
-    return torch.where(filled, depth - mean[:, None, None], depth)
-
-
 def render(points: Tensor, features: Tensor, side: int, radius: float = RADIUS) -> Tensor:
     """Images [3, side, side, c + 1] of a cloud: its features and, last, the centred depth.
 
@@ -369,7 +357,11 @@ def render(points: Tensor, features: Tensor, side: int, radius: float = RADIUS) 
         features: [n, c].
     """
     images, depth = splat(*z_buffer(points, features, side), radius)
-    return torch.cat([images, centred(depth)[..., None]], -1)
+    # Depth less the mean of each view's filled pixels; empty ones stay.
+    filled = depth >= 0
+    mean = torch.where(filled, depth, 0).sum((-2, -1)) / filled.sum((-2, -1)).clamp(min=1)
+    centred = torch.where(filled, depth - mean[:, None, None], depth)
+    return torch.cat([images, centred[..., None]], -1)
 
 
 @torch.no_grad()

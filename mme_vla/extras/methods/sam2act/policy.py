@@ -92,7 +92,12 @@ def augmented(
         shifted = (target + shift).clamp(low + _CLOSE_TO_EDGE, high - _CLOSE_TO_EDGE)
         angle = noise["turn"].flatten().to(target) * ROTATION
         points = shift_and_rotate(points, target, shifted - target, angle)
-        target, rotation = shifted, _turned(rotation, angle)
+        target = shifted
+        # Quaternions after a further turn about the vertical.
+        x, y, z, w = rotation.unbind(-1)
+        sin, cos = (angle / 2).sin(), (angle / 2).cos()
+        turned = [cos * x - sin * y, cos * y + sin * x, cos * z + sin * w, cos * w - sin * z]
+        rotation = torch.stack(turned, -1)
     return Scenes(
         points=points,
         colours=batch.colours.flatten(0, 1).to(points) / 255,
@@ -135,15 +140,6 @@ def first_loss(
         "gripper": entropy(outputs["gripper"], scenes.gripper),
         "collision": entropy(outputs["collision"], scenes.collision),
     }
-
-
-def _turned(rotation: Tensor, angle: Tensor) -> Tensor:
-    """Quaternions [n, 4] (x, y, z, w) after a further turn about the vertical."""
-    x, y, z, w = rotation.unbind(-1)
-    sin, cos = (angle / 2).sin(), (angle / 2).cos()
-    return torch.stack(
-        [cos * x - sin * y, cos * y + sin * x, cos * z + sin * w, cos * w - sin * z], -1
-    )
 
 
 STAGES = {

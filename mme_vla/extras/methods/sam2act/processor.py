@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -32,6 +32,9 @@ from mme_vla.processing.base import STATS_FILE, SampleSpec
 from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import TensorStruct
+
+if TYPE_CHECKING:
+    from mme_vla.extras.methods.sam2act.keyframes import KeyframeSample
 
 
 @dataclass
@@ -200,21 +203,6 @@ FINGER_OPEN, FINGER_COUNTS_OPEN = 0.04, 0.035
 LARGEST = 4096
 
 
-class Recorded(Protocol):
-    """A run of k keyframes as a dataset keeps them; see `KeyframeSample` in keyframes.py."""
-
-    @property
-    def goal(self) -> str: ...
-    @property
-    def shots(self) -> list[list[Shot]]: ...
-    @property
-    def open(self) -> np.ndarray: ...
-    @property
-    def places(self) -> np.ndarray: ...
-    @property
-    def targets(self) -> np.ndarray: ...
-
-
 @PROCESSORS.register(NAME)
 class SAM2ActProcessor(GoalProcessor):
     """Nothing here is normalised: points are metres, and the network's output is a waypoint in the
@@ -365,7 +353,7 @@ class SAM2ActProcessor(GoalProcessor):
 
     # Batches
 
-    def item(self, sample: Recorded) -> dict[str, Any]:
+    def item(self, sample: "KeyframeSample") -> dict[str, Any]:
         points, colours, states = [], [], []
         for shots, is_open, place in zip(sample.shots, sample.open, sample.places, strict=True):
             places, paint = cloud_of(shots, self.side)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import missing_extra
-from mme_vla.extras.methods.sam2act.config import LEVELS, EncoderSizes, SAM2ActSizes
+from mme_vla.extras.methods.sam2act.config import LEVELS, SAM2ActSizes
 
 _REDUCTION = 16
 """Pixels of the encoder's images to a patch of its third map."""
@@ -53,8 +53,32 @@ class ImageEncoder(nn.Module):
 
     def __init__(self, sizes: SAM2ActSizes) -> None:
         super().__init__()
+        try:
+            import transformers
+        except ImportError as error:
+            raise missing_extra("SAM2's image encoder", "baselines") from error
         self.side = sizes.grid * _REDUCTION
-        self.vision = _vision_model(sizes.encoder, self.side)
+        encoder = sizes.encoder
+        hiera: dict[str, Any] = {
+            "hidden_size": encoder.width,
+            "num_attention_heads": encoder.heads,
+            "image_size": [self.side, self.side],
+            "window_positional_embedding_background_size": [encoder.background] * 2,
+            "blocks_per_stage": list(encoder.blocks),
+            "embed_dim_per_stage": encoder.widths,
+            "num_attention_heads_per_stage": [encoder.heads * 2**stage for stage in range(LEVELS)],
+            "window_size_per_stage": list(encoder.windows),
+            "global_attention_blocks": list(encoder.global_blocks),
+        }
+        fine = self.side // 4
+        options: dict[str, Any] = {
+            "backbone_config": transformers.Sam2HieraDetConfig(**hiera),
+            "backbone_channel_list": encoder.widths[::-1],
+            "backbone_feature_sizes": [[fine >> level, fine >> level] for level in range(3)],
+            "fpn_hidden_size": encoder.neck,
+        }
+        vision: Any = transformers.Sam2VisionModel(transformers.Sam2VisionConfig(**options))
+        self.vision = vision
         for block in self.vision.backbone.blocks:
             block.attn.qkv = LoraProjection(block.attn.qkv, sizes.encoder.lora)
         self.fine = nn.Conv2d(sizes.encoder.neck, sizes.token // 4, 1)
@@ -71,32 +95,6 @@ class ImageEncoder(nn.Module):
         scaled = nn.functional.interpolate(images, size, mode="bilinear", align_corners=True)
         fine, middle, coarse = self.vision(scaled).fpn_hidden_states
         return self.fine(fine), self.middle(middle), coarse
-
-
-def _vision_model(sizes: EncoderSizes, side: int) -> Any:
-    try:
-        import transformers
-    except ImportError as error:
-        raise missing_extra("SAM2's image encoder", "baselines") from error
-    hiera: dict[str, Any] = {
-        "hidden_size": sizes.width,
-        "num_attention_heads": sizes.heads,
-        "image_size": [side, side],
-        "window_positional_embedding_background_size": [sizes.background, sizes.background],
-        "blocks_per_stage": list(sizes.blocks),
-        "embed_dim_per_stage": sizes.widths,
-        "num_attention_heads_per_stage": [sizes.heads * 2**stage for stage in range(LEVELS)],
-        "window_size_per_stage": list(sizes.windows),
-        "global_attention_blocks": list(sizes.global_blocks),
-    }
-    fine = side // 4
-    options: dict[str, Any] = {
-        "backbone_config": transformers.Sam2HieraDetConfig(**hiera),
-        "backbone_channel_list": sizes.widths[::-1],
-        "backbone_feature_sizes": [[fine >> level, fine >> level] for level in range(3)],
-        "fpn_hidden_size": sizes.neck,
-    }
-    return transformers.Sam2VisionModel(transformers.Sam2VisionConfig(**options))
 
 
 _GROWTH = 4  # of the channels, each time a mask's side is halved
@@ -242,22 +240,19 @@ class MemoryAttention(nn.Module):
             x, positions: [b, n, d]; n is a square's area.
             memory, places: [b, t·n, m], moment by moment.
         """
-        angles = grid_angles(round(x.shape[1] ** 0.5), x.shape[-1], x.device)
+        # Angles [n, d/2] of the places of the square, row by row: the first half by column, the
+        # second by row.
+        side, width = round(x.shape[1] ** 0.5), x.shape[-1]
+        steps = torch.arange(0, width, 4, device=x.device)[: width // 4]
+        rates = _BASE ** (-steps.float() / width)
+        line = torch.arange(side, device=x.device).float()
+        rows, columns = line.repeat_interleave(side), line.repeat(side)
+        angles = torch.cat([columns[:, None] * rates, rows[:, None] * rates], -1)
         x = x + _POSITION_SCALE * positions
         for layer in self.layers:
             x = layer(x, memory, places, angles)
         out: Tensor = self.norm(x)
         return out
-
-
-def grid_angles(side: int, width: int, device: torch.device | None = None) -> Tensor:
-    """Angles [side², width/2] of the places of a grid, row by row: the first half by column, the
-    second by row.
-    """
-    rates = _BASE ** (-torch.arange(0, width, 4, device=device)[: width // 4].float() / width)
-    line = torch.arange(side, device=device).float()
-    rows, columns = line.repeat_interleave(side), line.repeat(side)
-    return torch.cat([columns[:, None] * rates, rows[:, None] * rates], -1)
 
 
 def apply_rope(x: Tensor, angles: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ new window whole. What does not depend on the newest frames is read between two 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,22 +18,16 @@ from torch import Tensor
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.simplememvla.model import Prefill, VideoLanguageModel
 from mme_vla.extras.methods.simplememvla.prompt import VIDEO, Tokens
-from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.episode import Episode
 from mme_vla.types import FrameBatch
 
 if TYPE_CHECKING:
-    from mme_vla.extras.methods.simplememvla.processor import SimpleMemVlaProcessor
+    from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
 
 PIECE = 8
 """Temporal patches that one call of `advance` reads."""
 Pair = tuple[int, int]
 """The two frames of a temporal patch."""
-
-
-class VideoHost(Host, Protocol):
-    """What such an episode needs of its policy besides."""
-
-    def require_processor(self) -> "SimpleMemVlaProcessor": ...
 
 
 @dataclass
@@ -70,9 +64,9 @@ class VideoMemory:
 class VideoEpisode(Episode):
     """Recent frames of the memory camera beside the current view."""
 
-    _policy: VideoHost
+    _policy: "SimpleMemVlaPolicy"
 
-    def __init__(self, policy: VideoHost, goal: str, seed: int = 0) -> None:
+    def __init__(self, policy: "SimpleMemVlaPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self.video = VideoMemory()
         self.subtask = ""

@@ -40,6 +40,7 @@ from mme_vla.extras.methods.simplememvla.video import (
     resized,
 )
 from mme_vla.memory.base import stack_history
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import (
     CONFIG_FILE,
     STATS_FILE,
@@ -85,7 +86,8 @@ class PromptSettings:
 
 def processor_settings(config: Mapping[str, Any]) -> PromptSettings:
     """The section `processor` of a policy's configuration."""
-    return read_section(PromptSettings, without(config["processor"], "name"), "processor")
+    section = PolicySections.of(config).processor
+    return read_section(PromptSettings, without(section, "name"), "processor")
 
 
 @dataclass

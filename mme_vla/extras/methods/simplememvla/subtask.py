@@ -239,11 +239,18 @@ class SubtaskPolicy(MMEPolicy):
         }
 
     @torch.no_grad()
-    def sample_actions(self, batch: Batch, *args: Any, **options: Any) -> Tensor:
+    def sample_actions(
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor] | Tensor | None = None,
+        steps: int | None = None,
+        generator: torch.Generator | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> Tensor:
         """A chunk under the words that the policy generates; arguments as for `MMEPolicy`."""
-        if options.get("memory") is None:
-            options["memory"] = self.generate(batch)
-        return super().sample_actions(batch, *args, **options)
+        if memory is None:
+            memory = self.generate(batch)
+        return super().sample_actions(batch, noise, steps, generator, memory)
 
     @torch.no_grad()
     def generate(self, batch: Batch) -> MemoryTokens:
