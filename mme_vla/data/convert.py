@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +41,6 @@ from mme_vla.utils import (
     write_sums,
 )
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
-
-if TYPE_CHECKING:
-    pass
 
 
 @contextmanager

@@ -30,8 +30,8 @@ CHOSEN = ["RememberColor3", "SeqOfColors3"]
 def arguments(output: Path, **more: object) -> Namespace:
     values = {
         "output": output, "tasks": CHOSEN, "models": ["framesamp_modul", "pi05"], "seeds": 2,
-        "demonstrations": 3, "scenes": 2, "tower_steps": 1, "demonstrated": 1, "steps": 5, "episodes": 2, "pairs": 1,
-        "most_steps": MOST_STEPS, "jobs": 1,
+        "demonstrations": 3, "scenes": 2, "tower_steps": 1, "demonstrated": 1,
+        "steps": 5, "episodes": 2, "pairs": 1, "most_steps": MOST_STEPS, "jobs": 1,
     }  # fmt: skip
     return Namespace(**{**values, **more})
 
