@@ -29,7 +29,9 @@ ENV = "mikasa_choices"
 CAMERA = "wrist"
 WORDS = (
     "red", "lime", "blue", "yellow", "magenta", "cyan", "maroon", "olive", "teal",
-    "cube", "sphere", "cylinder", "cross", "torus", "star", "pyramide", "t_shape", "crescent",
+    "cube", "sphere", "cylinder", "cross", "torus", "star",
+    "pyramide",  # codespell:ignore pyramide
+    "t_shape", "crescent",
 )  # fmt: skip
 """What the tower locates, in place of RoboMME's classes: each colour and each shape."""
 HIDDEN = 1.0  # metres above the table: what is not shown is far beyond
