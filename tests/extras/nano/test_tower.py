@@ -18,6 +18,7 @@ from mme_vla.extras.nano.tower import (
     COLUMNS,
     FACTORS,
     FAINT,
+    NOTHING,
     ROWS,
     WAVES,
     WEIGHTS,
@@ -74,6 +75,20 @@ def test_presence_is_in_the_token_of_the_object_alone() -> None:
 def test_nearly_empty_cells_add_up_to_nothing() -> None:
     tokens = summarise(torch.full((1, K, 32, 32), 0.05), torch.zeros(1, K, 2, 32, 32))
     assert not tokens.any()
+
+
+@pytest.mark.parametrize(("in_use", "rows"), [(0.625, 5), (1.0, 8)])
+def test_a_tower_sees_the_part_of_the_image_that_is_in_use(in_use: float, rows: int) -> None:
+    config = TowerConfig(128, 16, 16, 16, 1, 1, 1, layout="places", in_use=in_use)
+    logits, _ = fresh_tower(config, 0).locate(torch.zeros(1, 3, 128, 128))
+    assert logits.shape[-2:] == (32, 32)
+    is_seen = (logits[0] > NOTHING).any(0).any(-1)
+    assert is_seen.tolist() == [True] * 4 * rows + [False] * (32 - 4 * rows)
+
+
+def test_in_use_is_a_share() -> None:
+    with pytest.raises(UserError, match=r"in_use=1\.5 must be more than 0 and at most 1"):
+        TowerConfig(layout="places", in_use=1.5)
 
 
 def test_a_fresh_tower_reports_nothing_and_its_seed_makes_it() -> None:
