@@ -20,7 +20,8 @@ PACKAGE = ROOT / "mme_vla"
 TABLES = "docs/extend/architecture.md"
 LOSS = "### One loss, step by step"
 CHUNK = "### One chunk, step by step"
-"""The functions of (a) and (d), in the order of reading."""
+EPISODE = "### One episode, step by step"
+"""The functions of (a), (d) and (g), in the order of reading."""
 SELECTION = ["memory/tokendrop.py", "memory/history.py", "memory/base.py"]
 HEAD = ["backbone/flow.py"]
 TRAINING = [

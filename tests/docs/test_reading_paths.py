@@ -38,6 +38,18 @@ def test_the_page_on_the_layout_has_the_counted_numbers() -> None:
                 ("policy/episode.py", "executable_actions"),
             ],
         ),
+        (
+            reading_paths.EPISODE,
+            500,
+            [
+                ("evaluation/rollout/evaluation.py", "EvaluationRun.run"),
+                ("envs/vector/pool.py", "serve"),
+                ("policy/scheduler.py", "Scheduler.next_steps"),
+                ("policy/base.py", "Policy.act"),
+                ("evaluation/rollout/environment.py", "ChunkEnv.step"),
+                ("evaluation/records.py", "RecordLog.append"),
+            ],
+        ),
     ],
 )
 def test_a_table_names_functions_that_exist_in_their_order(heading, most, on_the_way) -> None:
