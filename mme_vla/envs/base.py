@@ -28,9 +28,7 @@ from mme_vla.errors import UserError, check_known, listed, require
 from mme_vla.registry import ENVS
 
 Actions = Iterable[Any]
-"""Actions that `step` takes, one after the other. Those of a generator are asked for one by one, so
-that each can depend on what the one before has changed.
-"""
+"""Actions that `step` takes in turn. A generator makes each when the one before is done."""
 CHOICES = "multi_choice"
 OPTIONS = "available_multi_choices"
 _FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
@@ -109,8 +107,8 @@ class Environment(ABC):
         )
 
     def choices(self, env: Any) -> Mapping[str, Actions]:
-        """What can be chosen now, by policies whose actions are choices and in `play`: text → the
-        actions that carry it out. Empty: nothing.
+        """What a policy by choices, or a player, can choose now: text → the actions that do it.
+        Empty: nothing.
         """
         return {}
 
@@ -587,8 +585,7 @@ class EpisodeEnv:
             require(choices, f"{name} offers no choices to play: implement choices(env).")
             require(
                 len(choices) <= len(ascii_lowercase),
-                f"{name}.choices(env) has {len(choices)} entries, and there are"
-                f" {len(ascii_lowercase)} letters.",
+                f"{name}.choices(env) has {len(choices)} entries, and there are 26 letters.",
             )
             self._choices = {}
             options = []

@@ -109,7 +109,7 @@ def test_actions_of_a_generator_follow_from_what_the_one_before_has_changed(
     [
         ({}, "offers no choices"),
         ({"rest": []}, "no actions for 'rest'"),
-        ({f"go {number}": [0] for number in range(27)}, "27 entries.*26 letters"),
+        ({f"go {number}": [0] for number in range(27)}, "27 entries, and there are 26 letters"),
     ],
 )
 def test_choices_that_cannot_be_offered_are_refused(

@@ -159,12 +159,12 @@ def _by_choices(
     options: list[dict[str, Any]] = report.get(OPTIONS, [])
     parts = [received]
     video = length = len(received["state_list"])
-    chosen: dict[int, np.ndarray] = {}
+    choices: dict[int, np.ndarray] = {}  # by frame
     while report["status"] == "ongoing":
         choice = env.oracle()
         if choice is None:
             raise UserError(f"{env.spec.task}: the oracle has no choice.")
-        chosen[length if chosen else length - 1] = choice_action(robot.action, choice)
+        choices[length if choices else length - 1] = choice_action(robot.action, choice)
         received, *_, report = env.step(choice)
         parts.append(received)
         length += len(received["state_list"])
@@ -174,7 +174,7 @@ def _by_choices(
         images = [part[f"{camera}_rgb_list"] for part in parts]
         columns[f"{IMAGES}{camera}"] = np.concatenate(images)
     columns[ACTION] = np.zeros((length, robot.action.width), np.float32)
-    for frame, action in chosen.items():
+    for frame, action in choices.items():
         columns[ACTION][frame] = action
     columns[IS_DEMO] = np.arange(length)[:, None] < video - 1
     return columns, options, report["status"] == "success"
