@@ -33,6 +33,7 @@ CHOICES = "multi_choice"
 OPTIONS = "available_multi_choices"
 _FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
 _OTHER_SPLITS = 2_000_000  # first seed of splits with other names
+_END = object()  # of a choice's actions, each of which can be any value
 _MAX_IDLE = 4  # environments that a process keeps for further episodes
 
 
@@ -107,9 +108,7 @@ class Environment(ABC):
         )
 
     def choices(self, env: Any) -> Mapping[str, Actions]:
-        """What a policy by choices, or a player, can choose now: text → the actions that do it.
-        Empty: nothing.
-        """
+        """What a policy by choices, or a player, can choose now: text → the actions that do it."""
         return {}
 
     def facts(self, env: Any) -> Sequence[Fact]:
@@ -385,19 +384,19 @@ class EpisodeEnv:
         elif self._by_choice:
             parts = self._choices[action["choice"].lower()]
         remaining = iter(parts)
-        part = next(remaining, None)
-        require(part is not None, f"{self.spec.task}: what was chosen has no actions.")
+        part = next(remaining, _END)
+        require(part is not _END, f"{self.spec.task}: what was chosen has no actions.")
         frames = []
         total = 0.0
-        while part is not None:
+        while part is not _END:
             observation, reward, terminated, truncated, info = self._perform(part)
             total += float(reward)
             self._steps += 1
             truncated = bool(truncated) or self._steps >= self._limit
-            part = None
+            part = _END
             if not (terminated or truncated):
-                part = next(remaining, None)
-            frames.append(self._read_frame(observation, newest=part is None))
+                part = next(remaining, _END)
+            frames.append(self._read_frame(observation, newest=part is _END))
         report = self._info(info, bool(terminated), truncated)
         return self._lists(frames), total, bool(terminated), truncated, report
 
