@@ -4,6 +4,7 @@ scenes it takes.
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -173,15 +174,18 @@ def record(
 
     monkeypatch.setattr(scenes, "record_scene", take)
 
-    def names(
-        tower: object, files: list[Path], held_out: list[Path], *_: object
-    ) -> list[list[str]]:
-        return [[file.name for file in group] for group in (files, held_out)]
+    groups: list[list[str]] = []
 
-    monkeypatch.setattr(vision_pretrain, "pretrain", names)
+    def load(files: list[Path]) -> None:
+        groups.append([file.name for file in files])
+
+    monkeypatch.setattr(vision_pretrain, "Scenes", SimpleNamespace(load=load))
+    monkeypatch.setattr(vision_pretrain, "pretrain", lambda *_: None)
+    monkeypatch.setattr(vision_pretrain, "evaluate_tower", lambda *_: {})
     words = ("tasks=[StopCube]", "scenes=4", "held_out=1", "workers=1", *words)
     config = resolved(compose("vision_pretrain", [*words, f"output={tmp_path}"]))
-    return run(read_section(PretrainRun, config, others=True))
+    run(read_section(PretrainRun, config, others=True))
+    return groups
 
 
 def test_the_last_scenes_of_a_task_are_held_out_and_only_demonstrated(
