@@ -47,9 +47,9 @@ def views(scene: MikasaScene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """
     observation = scene.observe()
     yield observation[CAMERA](), _labels(scene)
-    if not scene.frozen:
+    if not scene.cue_end:
         return
-    while scene.time < scene.frozen:
+    while scene.time < scene.cue_end:
         observation, *_ = scene.step(np.zeros(7))
     yield observation[CAMERA](), _labels(scene)
 

@@ -294,7 +294,7 @@ class MikasaChoices(MikasaVideo):
 
     embodiment: ClassVar[Mapping[str, Any]] = {
         "name": "mikasa_choices",
-        # It looks down from above all objects, which are twice as large in its images as in `top`.
+        # It looks down from above all objects, which are larger in its images than in `top`.
         "cameras": {"wrist": {"augment": "none"}},
         "memory_camera": "wrist",
         "state": {"width": 7},
