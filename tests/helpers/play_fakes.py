@@ -53,6 +53,9 @@ class BlocksEnv:
         status = "fail" if not right else "success" if self.pressed == self.order else "ongoing"
         return self._observation(MOTION), 0.0, status != "ongoing", False, self._info(status)
 
+    def oracle(self) -> None:
+        """It has none."""
+
     def close(self) -> None:
         self.closed = True
 

@@ -96,7 +96,7 @@ class RandomPlayer(Player):
 @PLAYERS.register("oracle")
 class OraclePlayer(Player):
     """Knows the task's own script: the option that carries out the current sub-task, on the object
-    it is about. Of another environment it asks `oracle()`.
+    it is about. For another environment it calls `oracle()`.
 
     The upper bound of the protocol: what it fails at, planning or the rules of multi-choice failed
     at.
@@ -106,24 +106,22 @@ class OraclePlayer(Player):
     needs_images = False
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        from mme_vla.envs.oracle import OracleStuckError, oracle_choice
+        from mme_vla.envs.oracle import OracleStuckError, oracle_choice, oracle_of
 
         task = getattr(session.env, "task", None)
         if task is None:
-            known = None
-            if hasattr(session.env, "oracle"):
-                known = session.env.oracle()
-            if known is None:
+            choice = oracle_of(session.env)
+            if choice is None:
                 raise UserError(
                     "player=oracle: this environment has no oracle. Give it a method oracle(),"
                     ' which returns {"choice": letter}, or use env=mme_vla.'
                 )
-            return dict(known), {}
+            return dict(choice), {}
         try:
-            choice, text = oracle_choice(task)
+            action, text = oracle_choice(task)
         except OracleStuckError as error:
             raise NoChoiceError("error", str(error)) from None
-        return choice, {"subtask": text}
+        return action, {"subtask": text}
 
 
 def build_player(config: Mapping[str, Any]) -> Player:

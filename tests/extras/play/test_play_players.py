@@ -233,7 +233,7 @@ def test_the_oracle_is_this_librarys_or_the_environments_own(monkeypatch):
     session.start()
     with pytest.raises(UserError, match=r"Give it a method oracle\(\).*or use env=mme_vla"):
         OraclePlayer().choose(session)
-    monkeypatch.setattr(session.env, "oracle", lambda: {"choice": "b"}, raising=False)
+    monkeypatch.setattr(session.env, "oracle", lambda: {"choice": "b"})
     assert OraclePlayer().choose(session) == ({"choice": "b"}, {})
 
 
