@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment.robomme import LETTERS, choice_row
+from mme_vla.embodiment.robomme import CHOICE_SPACE, LETTERS, choice_action
 from mme_vla.errors import UserError, brief
 from mme_vla.utils import parse_json
 
@@ -107,4 +107,6 @@ def row_of(text: str) -> np.ndarray | None:
             f'{brief(text)} is no choice; expected {{"choice": "A", "point": [y, x]}}, letters A'
             " to H."
         )
-    return choice_row(letter, point.tolist()) if letter else None
+    if not letter:
+        return None
+    return choice_action(CHOICE_SPACE, {"choice": letter, "point": point.tolist()})

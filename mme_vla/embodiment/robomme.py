@@ -22,6 +22,14 @@ image.
 LETTERS = "abcdefgh"
 """Of the options that a task can offer."""
 
+CHOICE_SPACE = ActionSpace(
+    width=len(LETTERS) + 2,
+    choice=tuple(range(len(LETTERS))),
+    point=(len(LETTERS), len(LETTERS) + 1),
+    frames=None,
+)
+"""Of the benchmark's choices as numbers: eight letters of which one is 1, then y and x."""
+
 ROBOMME_JOINT = Embodiment(
     name="robomme_joint",
     cameras=(Camera("front", "image", "all"), Camera("wrist", "wrist_image", "colour")),
@@ -94,20 +102,6 @@ def choice_action(space: ActionSpace, choice: Mapping[str, Any]) -> np.ndarray:
         point = choice.get("point") or ()
         action[list(space.point)] = np.divide(point, SIDE) if len(point) else MIDDLE
     return action
-
-
-def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
-    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of
-    the image.
-
-    Args:
-        letter: `a` to `h`.
-        point: y and x in pixels of the front image; empty for a choice that needs none.
-    """
-    row = np.zeros(len(LETTERS) + 2, np.float32)
-    row[LETTERS.index(letter)] = 1
-    row[len(LETTERS) :] = np.divide(point, SIDE) if len(point) else MIDDLE
-    return row
 
 
 def benchmark_state(

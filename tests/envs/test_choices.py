@@ -24,7 +24,7 @@ from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.data.waypoints import find_motions, row_of
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option, read_options
-from mme_vla.embodiment.robomme import benchmark_action, choice_row
+from mme_vla.embodiment.robomme import CHOICE_SPACE, benchmark_action, choice_action
 from mme_vla.envs.vector.pool import Job
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
@@ -39,7 +39,7 @@ SPACE = CHOOSER.action
 
 def test_a_choice_survives_the_way_through_the_robots_numbers() -> None:
     for letter, point in (("a", [54, 145]), ("h", [255, 0]), ("c", [])):
-        row = torch.from_numpy(choice_row(letter, point))
+        row = torch.from_numpy(choice_action(CHOICE_SPACE, {"choice": letter, "point": point}))
         state = torch.zeros(8)
         back = SPACE.to_absolute(SPACE.to_relative(row[None], state), state)
         action = benchmark_action(SPACE, SPACE.decide(back, read_options(EIGHT, 8))[0].numpy())
@@ -118,7 +118,7 @@ def test_options_that_nobody_can_choose_among_are_refused(given: Any) -> None:
 def test_every_choice_is_decided_on_one_frame_before_it_begins_even_the_same_twice() -> None:
     rows = np.zeros((12, 10), np.float32)
     for frame, letter in ((2, "a"), (5, "b"), (9, "b")):
-        rows[frame] = choice_row(letter, [])
+        rows[frame] = choice_action(CHOICE_SPACE, {"choice": letter})
     choices = find_motions(rows, 50, SPACE.choice)
     assert choices.decisions.tolist() == [50, 54, 58] and choices.targets[:, 1].tolist() == [
         0,
@@ -141,7 +141,7 @@ def test_recorded_choices_are_converted_and_read_as_decisions(folder: Path) -> N
     chunk, recorded = source.action_chunk(0, 15, 4)
     assert recorded.tolist() == [True, True, False, False]
     expected = [choice_at(number) for number in (4, 5, 5, 5)]
-    assert np.array_equal(chunk, [choice_row(c["choice"].lower(), c["point"]) for c in expected])
+    assert np.array_equal(chunk, [choice_action(CHOICE_SPACE, c) for c in expected])
 
 
 def test_letters_that_are_seldom_selected_stay_numbers_of_ordinary_size(folder: Path) -> None:

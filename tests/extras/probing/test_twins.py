@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mme_vla.config.plugins import import_plugins
-from mme_vla.embodiment.robomme import choice_row
+from mme_vla.embodiment.robomme import CHOICE_SPACE, choice_action
 from mme_vla.envs import make
 from mme_vla.envs.base import environment
 from mme_vla.envs.facts import Candidates
@@ -257,7 +257,7 @@ def check_script(task: str, folder: Path) -> None:
     def scripted(_: PlantedEpisode) -> np.ndarray:
         choice = oracle_of(made[-1])
         assert choice is not None
-        return choice_row(str(choice["choice"]).lower(), choice.get("point") or ())[None]
+        return choice_action(CHOICE_SPACE, choice)[None]
 
     policy = Planted(small_policy("pi05", embodiment="robomme_choice_front"), scripted)
     jobs = [Job(task, "test", episode) for episode in range(2)]
