@@ -185,7 +185,7 @@ class MikasaScene(gymnasium.Env[Any, Any]):
 
     def oracle(self) -> dict[str, str]:
         """The choice that leads to success."""
-        return {"choice": ascii_lowercase[self.scene_facts.right_choice()]}
+        return {"choice": ascii_lowercase[self.scene_facts.correct_choice()]}
 
     def close(self) -> None:
         """Free the simulator."""

@@ -73,7 +73,7 @@ class SceneFacts:
         """What can be chosen, the same at every moment: text → the actions that do it."""
         return {}
 
-    def right_choice(self) -> int:
+    def correct_choice(self) -> int:
         """The number, among the choices, of the one that leads to success."""
         raise NotImplementedError
 
@@ -165,12 +165,16 @@ class Recall(SceneFacts):
     def choices(self) -> Mapping[str, Actions]:
         hand = Hand(self._scene)
         choices = {}
-        for name, thing in self.things().items():
-            touch = touch_thing(hand, partial(_offset, hand, thing))
-            choices[f"touch the {name}"] = self._after_cue(hand, touch)
+        for key in self._things:
+            touch = self._touch(hand, key)
+            choices[f"touch the {self._described(key)}"] = self._after_cue(hand, touch)
         return choices
 
-    def right_choice(self) -> int:
+    def _touch(self, hand: Hand, key: int) -> Actions:
+        """The actions that touch an object."""
+        return touch_thing(hand, partial(_offset, hand, self._things[key]))
+
+    def correct_choice(self) -> int:
         return list(self._things).index(self._answers[0])
 
     def _after_cue(self, hand: Hand, script: Actions) -> Actions:
@@ -250,14 +254,13 @@ class Several(Recall):
 
     def choices(self) -> Mapping[str, Actions]:
         hand = Hand(self._scene)
-        choices = {}
-        for key in self._things:
-            touch = touch_cube(hand, key)
-            choices[f"touch the {self._described(key)}"] = self._after_cue(hand, touch)
-        choices["press the button"] = self._after_cue(hand, press_button(hand))
-        return choices
+        press = self._after_cue(hand, press_button(hand))
+        return {**super().choices(), "press the button": press}
 
-    def right_choice(self) -> int:
+    def _touch(self, hand: Hand, key: int) -> Actions:
+        return touch_cube(hand, key)
+
+    def correct_choice(self) -> int:
         touched = self._scene.touched_cubes[0]
         for key in self._answers:
             if not bool(touched[key]):
@@ -328,7 +331,7 @@ class Origin(SceneFacts):
             choices[f"bring the cube back to the {name}"] = carry(hand, place)
         return choices
 
-    def right_choice(self) -> int:
+    def correct_choice(self) -> int:
         if not bool(self._scene.goal_reached_status[0]):
             return 0
         return 1 + self._column()
