@@ -1,13 +1,11 @@
 """MIKASA-Robo-VLA by choices: what can be chosen, and the oracle that knows the answer."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mme_vla.embodiment import Embodiment
-from mme_vla.envs import base
 from mme_vla.envs.base import CHOICES, OPTIONS, environment
 from mme_vla.errors import UserError
 from mme_vla.extras.mikasa.catalog import FAMILY_OF
@@ -20,17 +18,6 @@ def test_tasks_are_those_whose_answer_is_one_of_several_things() -> None:
     assert kinds == {"Object", "Negative", "Spatial", "Capacity", "Sequential"}
     with pytest.raises(UserError, match=r"RotateLenientPos has nothing to choose: take env=mikasa"):
         source.check_task("RotateLenientPos")
-
-
-@pytest.fixture
-def simulator() -> Iterator[None]:
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim`")
-    pytest.importorskip(
-        "mikasa_robo_suite", reason="MIKASA-Robo-VLA is not installed: the extra `mikasa`"
-    )
-    yield
-    while base._idle:
-        base._idle.popitem()[1].close()
 
 
 def opened(task: str, episode: int = 0, **more: Any) -> Any:

@@ -1,6 +1,5 @@
 """Facts of MIKASA-Robo-VLA's scenes, and twins in which one of them is flipped."""
 
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from mme_vla.envs import base
 from mme_vla.envs.base import environment
 from mme_vla.envs.facts import FactLog
 from mme_vla.extras.mikasa.catalog import FAMILY_OF
@@ -115,17 +113,6 @@ def test_tasks_whose_answer_is_an_object_have_twins() -> None:
 
 
 # In the simulator ---------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def simulator() -> Iterator[None]:
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim`")
-    pytest.importorskip(
-        "mikasa_robo_suite", reason="MIKASA-Robo-VLA is not installed: the extra `mikasa`"
-    )
-    yield
-    while base._idle:
-        base._idle.popitem()[1].close()
 
 
 @pytest.mark.slow
