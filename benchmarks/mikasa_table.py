@@ -36,7 +36,7 @@ from mme_vla.extras.nano.rows import CHOICES, read_rows, table_of
 from mme_vla.utils import write_atomically
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from benchmarks.mikasa_tower import BACKBONE, ENV, make_tower, start
+from benchmarks.mikasa_tower import BACKBONE, ENV, make_tower, save_initial_policy
 
 MOST_STEPS = 180
 """Steps of an episode, of tasks whose own limit is longer: 87 to 120 demonstrate those of three
@@ -52,7 +52,7 @@ TASKS = (
     "TakeItBack", "BunchOfColors3", "BunchOfColors5", "SeqOfColors3", "ChainOfColors3",
     "ChainOfColors5",
 )  # fmt: skip
-SEEN = (
+TOWER_TASKS = (
     "RememberColor9", "RememberShape9", "RememberShapeAndColor5x3", "FindImposterColor9",
     "FindImposterShape9", "FindImposterShapeAndColor5x3", "TakeItBack", "BunchOfColors3",
     "SeqOfColors3",
@@ -134,10 +134,12 @@ def measure(args: argparse.Namespace, run: Run | None = None) -> list[dict[str, 
     missing = [task for task in args.tasks if not recording(folder, task).is_dir()]
     with ThreadPoolExecutor(args.jobs) as pool:
         list(pool.map(partial(_record, args=args, run=run), missing))
-    for seed in range(args.seeds):
-        if not beginning(folder, seed).is_dir():
-            tower = make_tower(SEEN, folder / "tower", args.scenes, args.tower_steps, args.jobs)
-            start(tower, beginning(folder, seed), seed)
+    seeds = [seed for seed in range(args.seeds) if not initial_policy(folder, seed).is_dir()]
+    if seeds:
+        place = folder / "tower"
+        tower = make_tower(TOWER_TASKS, place, args.scenes, args.tower_steps, args.jobs)
+        for seed in seeds:
+            save_initial_policy(tower, initial_policy(folder, seed), seed)
 
     table = folder / "table.csv"
     known = {(row["model"], row["seed"], row["task"]) for row in read_table(table)}
@@ -158,7 +160,7 @@ def recording(folder: Path, task: str) -> Path:
     return folder / "demonstrations" / task
 
 
-def beginning(folder: Path, seed: int) -> Path:
+def initial_policy(folder: Path, seed: int) -> Path:
     """Where the policy is from which the trainings of a seed begin."""
     return folder / "tower" / f"policy-{seed}"
 
@@ -190,7 +192,7 @@ def _rows_of(
     training = folder / "training" / name
     if not (training / "summary.json").is_file():
         words = [f"model={model}", *MODELS[model], *TRAINING]
-        words += [f"init_from={beginning(folder, seed)}", f"seed={seed}"]
+        words += [f"init_from={initial_policy(folder, seed)}", f"seed={seed}"]
         words += [f"train.steps={args.steps}", "resume=auto", f"output={training}"]
         run(["train", f"env={ENV}", f"data.sources=[{data}]", *BACKBONE, *words])
 

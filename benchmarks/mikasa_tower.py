@@ -27,7 +27,7 @@ from mme_vla.utils import write_atomically
 
 ENV = "mikasa_choices"
 CAMERA = "wrist"
-WORDS = (
+ATTRIBUTES = (
     "red", "lime", "blue", "yellow", "magenta", "cyan", "maroon", "olive", "teal",
     "cube", "sphere", "cylinder", "cross", "torus", "star",
     "pyramide",  # codespell:ignore pyramide
@@ -42,7 +42,7 @@ def views(scene: MikasaScene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The cue, and the table when the answer can be given, of a scene that was just reset.
 
     Yields:
-        An image [128, 128, 3], and rows [m, 3] of what it shows: number of the word, column and
+        An image [128, 128, 3], and rows [m, 3] of what it shows: number of the attribute, column and
         row in the image, 0 … 1.
     """
     observation = scene.observe()
@@ -66,7 +66,7 @@ def _labels(scene: MikasaScene) -> np.ndarray:
         x, y, depth = intrinsic @ (extrinsic @ [*place, 1.0])
         column, row = np.array([x, y]) / depth / 128
         if depth > 0 and 0 <= column < 1 and 0 <= row < 1:
-            rows += [(WORDS.index(word), column, row) for word in name.split()]
+            rows += [(ATTRIBUTES.index(word), column, row) for word in name.split()]
     return np.array(rows, np.float32).reshape(-1, 3)
 
 
@@ -110,7 +110,7 @@ def load(files: Sequence[Path]) -> Scenes:
 
 def make_tower(tasks: Sequence[str], folder: Path, count: int, steps: int, jobs: int) -> PlaceTower:
     """A tower that was trained on renders of these tasks; what the folder holds already stays."""
-    assert len(WORDS) <= len(CLASSES)
+    assert len(ATTRIBUTES) <= len(CLASSES)
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)
     files = []
@@ -125,7 +125,7 @@ def make_tower(tasks: Sequence[str], folder: Path, count: int, steps: int, jobs:
     return tower
 
 
-def start(tower: PlaceTower, folder: Path, seed: int) -> None:
+def save_initial_policy(tower: PlaceTower, folder: Path, seed: int) -> None:
     """Save a fresh policy with this tower, from which trainings begin (`init_from`)."""
     policy = build_from_config(
         compose("policy", ["model=pi05", f"env={ENV}", *BACKBONE]), seed=seed

@@ -41,7 +41,7 @@ def no_tower(monkeypatch: pytest.MonkeyPatch) -> None:
     """Policies to start from are empty folders."""
     monkeypatch.setattr(mikasa_table, "make_tower", lambda *args: None)
     monkeypatch.setattr(
-        mikasa_table, "start", lambda tower, folder, seed: folder.mkdir(parents=True)
+        mikasa_table, "save_initial_policy", lambda tower, folder, seed: folder.mkdir(parents=True)
     )
 
 
