@@ -42,8 +42,8 @@ def views(scene: MikasaScene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The cue, and the table when the answer can be given, of a scene that was just reset.
 
     Yields:
-        An image [128, 128, 3], and rows [m, 3] of what it shows: number of the attribute, column and
-        row in the image, 0 … 1.
+        An image [128, 128, 3], and rows [m, 3] of what it shows: number of the attribute, column
+        and row in the image, 0 … 1.
     """
     observation = scene.observe()
     yield observation[CAMERA](), _labels(scene)
