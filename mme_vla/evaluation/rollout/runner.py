@@ -247,7 +247,7 @@ class Rollout:
             return
         if reply.is_reset:
             self._stillborn = 0
-            if self._restarts(running, reply):
+            if self._rerenders_video(running, reply):
                 return
             running.begin(reply.observation)
         else:
@@ -298,8 +298,8 @@ class Rollout:
                 " finished episodes are kept."
             )
 
-    def _restarts(self, running: RunningEpisode, reply: Reply) -> bool:
-        """Restart the episode if required video frames were not rendered."""
+    def _rerenders_video(self, running: RunningEpisode, reply: Reply) -> bool:
+        """Reset the episode once more if video frames that its memory reads were not rendered."""
         length = len(reply.observation["state"]) - 1
         first = running.first_video_frames
         if first not in (None, length):
