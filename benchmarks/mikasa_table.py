@@ -16,7 +16,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -109,7 +109,12 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write all rows in one step, so that none is ever cut off."""
+    """Write all rows in one step, so that none is ever cut off; by seed, model and task."""
+    models, tasks = list(MODELS), list(STEPS)
+    rows = sorted(
+        rows,
+        key=lambda row: (int(row["seed"]), models.index(row["model"]), tasks.index(row["task"])),
+    )
     with write_atomically(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -150,8 +155,13 @@ def measure(args: argparse.Namespace, run: Run | None = None) -> list[dict[str, 
             if missing:
                 units.append((model, seed, missing))
     with ThreadPoolExecutor(args.jobs) as pool:
-        for new in pool.map(partial(_rows_of, args=args, run=run), units):
-            write_table(table, [*read_table(table), *new])
+        running = [pool.submit(_rows_of, unit, args, run) for unit in units]
+        try:
+            for unit in as_completed(running):
+                write_table(table, [*read_table(table), *unit.result()])
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # what has not begun
+            raise
     return read_table(table)
 
 
