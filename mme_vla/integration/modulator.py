@@ -57,7 +57,9 @@ class ModulatorLayer(nn.Module):
         padding included.
         """
         q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
-        q = rotate(q, rotation(_positions(x, first=k.shape[1]), self.head_dim))
+        first = k.shape[1]
+        positions = torch.arange(first, first + x.shape[1], device=x.device)[None]
+        q = rotate(q, rotation(positions, self.head_dim))
         return self.out(attend(q, k, v, mask))
 
     def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
@@ -117,7 +119,7 @@ class Modulator(Integration):
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
         # Queries have positions after all memory slots, padding included; those of memory count
         # from the same origin.
-        positions = _positions(tokens)
+        positions = torch.arange(tokens.shape[1], device=tokens.device)[None]
         if self.memory_position == "time":
             positions = tokens.shape[1] - 1 - ages_of(memory)
         rope = rotation(positions, self.head_dim)
@@ -128,8 +130,3 @@ class Modulator(Integration):
             k, v = self._keys_values(layer, tokens, rope)
             hooks.append(partial(layer, k=k, v=v, mask=mask))
         return LayerHooks(hooks)
-
-
-def _positions(x: Tensor, first: int = 0) -> Tensor:
-    """Positions [1, n] of tokens x [b, n, d], counted from `first`."""
-    return torch.arange(first, first + x.shape[1], device=x.device)[None]

@@ -198,9 +198,11 @@ class Engine:
         self.stats.took("batch", time.perf_counter() - begun)
         self.stats.count("batched", len(batch))
         for waiting, chunk in zip(batch, chunks, strict=True):
+            if waiting.future.done():
+                continue
             if isinstance(chunk, Exception):
-                _fail(waiting.future, chunk)
-            elif not waiting.future.done():
+                waiting.future.set_exception(chunk)
+            else:
                 waiting.future.set_result(chunk)
                 self.scheduler.later[waiting.work] = None
 
@@ -241,7 +243,8 @@ class Engine:
             finished = await self.call(lambda: next(waiting.work, _END)) is _END
         except Exception as error:
             waiting.pieces = 0
-            _fail(waiting.future, error)
+            if not waiting.future.done():
+                waiting.future.set_exception(error)
             return
         if not finished:
             waiting.pieces = max(1, waiting.pieces - 1)
@@ -271,8 +274,3 @@ def _try_out(policy: Policy, n_episodes: int, n_frames: int, flow_steps: int | N
 
 
 _END = object()
-
-
-def _fail(future: asyncio.Future, error: Exception) -> None:
-    if not future.done():
-        future.set_exception(error)

@@ -69,32 +69,6 @@ def planner_system(task: str, kind: str) -> str:
     return "\n\n".join(parts)
 
 
-def opening_query(goal: str, video: bool) -> str:
-    """Return the planner's first question; the video and the image come before it."""
-    context = "The image shows the scene at the start."
-    if video:
-        context = (
-            "The video shows what happened before the robot's turn, the image shows the scene now."
-            " Note what has to be remembered of the video."
-        )
-    return f"The task: {goal}\n{context} Name the first subgoal."
-
-
-def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
-    """Return a later question to the planner; the video of the finished subgoal comes before it.
-
-    Args:
-        clip: whether there is such a video beside the image.
-    """
-    context = "The image shows the scene now."
-    if clip:
-        context = "The video shows how it was done, the image the scene now."
-    return (
-        f"The task: {goal}\nYour notebook:\n{notes}\nThe subgoal {finished!r} is complete."
-        f" {context} Bring the notebook up to date, and name the next subgoal."
-    )
-
-
 MOST_NOTES = 16
 MOST_STEPS = 32  # of a route
 MOST_WORDS = 200  # characters of a text
@@ -344,13 +318,24 @@ class NotebookPredictor(PromptedPredictor):
         finished = episode.subgoal.text
         if finished is None:
             images = [MediaPart(episode.frame)]
+            context = "The image shows the scene at the start."
             if len(episode.video):
                 images.insert(0, MediaPart(episode.video))
-            query = opening_query(episode.goal, len(images) > 1)
+                context = (
+                    "The video shows what happened before the robot's turn, the image shows the"
+                    " scene now. Note what has to be remembered of the video."
+                )
+            query = f"{context} Name the first subgoal."
         else:
             images = episode.images()
-            notes = episode.notebook.in_words()
-            query = next_query(episode.goal, finished, notes, len(images) > 1)
+            context = "The image shows the scene now."
+            if len(images) > 1:
+                context = "The video shows how it was done, the image the scene now."
+            query = (
+                f"Your notebook:\n{episode.notebook.in_words()}\nThe subgoal {finished!r} is"
+                f" complete. {context} Bring the notebook up to date, and name the next subgoal."
+            )
+        query = f"The task: {episode.goal}\n{query}"
         system = planner_system(episode.task, self.kind)
         reply = self.api.ask(system, [("user", [*images, query])]).text
         replies.append(reply)

@@ -133,11 +133,11 @@ def sample_jointly(
     """A chunk [b, h, a] by the head's Euler steps, each of which runs the network in one pass."""
     x = head.start(draws, steps, None)
     times = head.times(steps, x.device)
-
-    def predict(x_t: Tensor, index: int) -> Tensor:
-        return policy.predict(batch, x_t, times[index].expand(len(x_t)), memory)
-
-    velocity = head.velocity(predict, times, draws)
+    velocity = head.velocity(
+        lambda x_t, index: policy.predict(batch, x_t, times[index].expand(len(x_t)), memory),
+        times,
+        draws,
+    )
     for index in range(len(times)):
         x = head.step(x, velocity(x, index), len(times))
     return x

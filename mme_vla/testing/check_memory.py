@@ -198,10 +198,6 @@ def _encoded(memory: Memory, history: HistoryTokens) -> MemoryTokens:
     return memory(history)
 
 
-def _gathered(memory: Memory, history: History, *steps: int) -> HistoryTokens:
-    return stack_history([memory.gather_selection(history, step) for step in steps])
-
-
 def _valid(tokens: MemoryTokens) -> Tensor:
     return tokens.tokens * tokens.mask[..., None]
 
@@ -211,7 +207,8 @@ def check_encoding(memory: Memory, frames: int) -> None:
     learns.
     """
     full = Episode(memory, frames).cached()
-    history = _gathered(memory, full, 2, frames - 1)  # the first with padding, if it is shorter
+    selections = [memory.gather_selection(full, step) for step in (2, frames - 1)]
+    history = stack_history(selections)  # the first with padding, if it is shorter
     encoded = _encoded(memory, history)
     shape = (2, memory.budget, WIDTH)
     assert encoded.tokens.shape == shape, (
@@ -283,7 +280,7 @@ def check_rebuilding(name: str, options: dict[str, Any], memory: Memory) -> None
     assert names == expected, f"made on meta it has other tensors: {sorted(names ^ expected)}."
     copy: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
     copy.load_state_dict(memory.state_dict())
-    history = _gathered(memory, Episode(memory, 40).cached(), 39)
+    history = stack_history([memory.gather_selection(Episode(memory, 40).cached(), 39)])
     again, first = _encoded(copy.eval(), history), _encoded(memory, history)
     error = float((_valid(again) - _valid(first)).abs().max())
     assert error <= TOLERANCE, (

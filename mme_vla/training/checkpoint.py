@@ -94,12 +94,14 @@ def save_checkpoint(
     with ema.applied():
         save_policy(policy, draft, facts=facts, self_check=self_check)
     parameters = trainable(policy)
-    save_file({name: _on_cpu(p) for name, p in parameters.items()}, draft / RAW)
+    raw = {name: p.detach().cpu().contiguous() for name, p in parameters.items()}
+    save_file(raw, draft / RAW)
     moments = {}
     for name, p in parameters.items():
         if p in optimizer.state:
             for key in _ADAM:
-                moments[f"{name}/{key}"] = _on_cpu(optimizer.state[p][key])
+                moment = optimizer.state[p][key]
+                moments[f"{name}/{key}"] = moment.detach().cpu().contiguous()
     save_file(moments, draft / OPTIMIZER)
     _write_state(draft, step, config)
     write_sums(draft, (RAW, OPTIMIZER, STATE), keep=True)
@@ -312,10 +314,6 @@ def _publish(draft: Path, target: Path) -> Path:
             os.close(handle)
     replace_folder(draft, target)
     return target
-
-
-def _on_cpu(tensor: Tensor) -> Tensor:
-    return tensor.detach().cpu().contiguous()
 
 
 def _read(path: Path) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ them reads it again.
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -195,7 +195,7 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     for file in share:
         sums[file].check(file.name)
     reader = dcp.HuggingFaceStorageReader(str(folder))
-    with _decoding(folder):
+    with decoding(folder, "shards of a checkpoint", _REMEDY):
         metadata = reader.read_metadata().state_dict_metadata
         stored = {name: about.size for name, about in metadata.items()}  # type: ignore[union-attr]
     wrong = []
@@ -214,16 +214,12 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
         with _quiet():
             dcp.load(tensors, storage_reader=reader, no_dist=alone)
     except CheckpointException as error:  # what the processes met with, by their numbers
-        with _decoding(folder):
+        with decoding(folder, "shards of a checkpoint", _REMEDY):
             raise next(iter(error.failures.values()))[0] from error
     local = {}
     for name, tensor in tensors.items():
         local[name] = tensor.to_local() if isinstance(tensor, DTensor) else tensor
     check_values(local, str(folder))
-
-
-def _decoding(folder: Path) -> AbstractContextManager[None]:
-    return decoding(folder, "shards of a checkpoint", _REMEDY)
 
 
 @contextmanager

@@ -47,12 +47,16 @@ class VideoWriter:
         preset: str = "veryfast",
     ) -> None:
         import av
+        import torch
 
         if isinstance(target, Path):
             target = str(target)
         self._container: Any = av.open(target, "w", format="mp4")
         self._rate = Fraction(fps)
-        self._options = {"crf": str(crf), "preset": preset, "threads": "1", **_routines()}
+        self._options = {"crf": str(crf), "preset": preset, "threads": "1"}
+        if torch.backends.cpu.get_cpu_capability() == "AVX512":
+            # x264's AVX-512 routines read uninitialised memory: equal frames made unequal bytes.
+            self._options["x264-params"] = "asm=MMX2,SSE2Fast,SSSE3,SSE4.2,AVX,FMA3,BMI2,AVX2"
         self._stream: Any = None
         self.frames = 0
 
@@ -253,14 +257,3 @@ def fitted(text: str, width: int, size: int) -> str:
     while text and face.getlength(text + "…") > width:
         text = text[:-1]
     return text.rstrip() + "…"
-
-
-def _routines() -> dict[str, str]:
-    """Keeps x264 from its AVX-512 routines, which read uninitialised memory: equal frames made
-    unequal bytes.
-    """
-    import torch
-
-    if torch.backends.cpu.get_cpu_capability() != "AVX512":
-        return {}
-    return {"x264-params": "asm=MMX2,SSE2Fast,SSSE3,SSE4.2,AVX,FMA3,BMI2,AVX2"}

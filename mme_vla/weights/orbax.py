@@ -377,11 +377,11 @@ def _arrays(names: list[str]) -> str | None:
             if name.endswith(tuple(ARRAY_FILES)):
                 *above, _, _ = name.split("/")  # without the array's folder and file
                 stores.append("/".join([*above, ""]).lstrip("/"))
-
-    def order(place: str) -> tuple[bool, int, str]:
-        return not place.endswith("params/"), place.count("/"), place
-
-    return min(stores, key=order, default=None)
+    return min(
+        stores,
+        key=lambda place: (not place.endswith("params/"), place.count("/"), place),
+        default=None,
+    )
 
 
 def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.ZipInfo]) -> Path:

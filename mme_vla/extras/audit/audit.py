@@ -96,12 +96,13 @@ def run_audit(
     for name, mark in ((PAGE, MARK), (FIGURES, "conclusion")):
         require_earlier(folder / name, mark)
     require(jobs, "There is no scene: name some with tasks=… and episodes=….")
-
-    def run_matched(plan: ProbePlan) -> None:
-        run_probe(policy, plan, folder, facts, settings, options)
-
     if audit.minutes is not None:
-        jobs = _affordable_scenes(jobs, folder, audit.minutes, run_matched)
+        jobs = _affordable_scenes(
+            jobs,
+            folder,
+            audit.minutes,
+            lambda plan: run_probe(policy, plan, folder, facts, settings, options),
+        )
     plan = ProbePlan(lend=recordings, jobs=jobs)
     references = dict(references or {})
     notes = []
@@ -150,7 +151,7 @@ def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:
 
 
 def _affordable_scenes(
-    jobs: Sequence[Job], folder: Path, minutes: float, run_matched: Callable[[ProbePlan], None]
+    jobs: Sequence[Job], folder: Path, minutes: float, run_matched: Callable[[ProbePlan], object]
 ) -> list[Job]:
     """As many of the scenes as the minutes allow, the same for each task; a repeated command takes
     those of before.
@@ -180,7 +181,7 @@ def _first_scenes(by_task: Mapping[str, Sequence[Job]], count: int) -> list[Job]
 
 
 def _seconds_a_scene(
-    pilot: ProbePlan, records: Path, run_matched: Callable[[ProbePlan], None]
+    pilot: ProbePlan, records: Path, run_matched: Callable[[ProbePlan], object]
 ) -> float:
     """Run the scenes that have no record, and measure how long one takes.
 

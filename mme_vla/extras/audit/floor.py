@@ -48,7 +48,11 @@ class RandomPolicy(Policy):
             return {"chunk": torch.rand(self.horizon, space.width, generator=generator)}
         which, place = torch.rand(2, generator=generator).tolist()
         recording = self._recordings[int(which * len(self._recordings))]
-        actions = _executed(recording)
+        source, episode = recording.source, recording.episode
+        if source.robot.action.frames is None:
+            actions = source.past_actions(episode, recording.length - 1, recording.length)
+        else:
+            actions = source.actions(episode, recording.exec_start)
         # A chunk that begins near the end repeats the last action.
         steps = int(place * len(actions)) + np.arange(self.horizon)
         chunk = actions[np.minimum(steps, len(actions) - 1)]
@@ -65,11 +69,3 @@ class RandomPolicy(Policy):
             episode.acted(chunk)
             chunks.append(chunk)
         return np.stack(chunks)
-
-
-def _executed(recording: Recording) -> np.ndarray:
-    """The actions of a recorded execution, in order, [n, w]."""
-    source, episode = recording.source, recording.episode
-    if source.robot.action.frames is None:
-        return source.past_actions(episode, recording.length - 1, recording.length)
-    return source.actions(episode, recording.exec_start)

@@ -5,7 +5,6 @@ Tasks whose models the package lacks have none: `SceneFacts`.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -78,11 +77,6 @@ class SceneFacts:
         raise NotImplementedError
 
 
-def _offset(hand: Hand, thing: Any) -> np.ndarray:
-    """From the hand to a thing [3], metres."""
-    return place_of(thing) - hand.position
-
-
 class Recall(SceneFacts):
     """Remember: one object is shown. FindImposter: all but one are shown, and that one is right.
     All are on the table when the answer can be given.
@@ -95,13 +89,6 @@ class Recall(SceneFacts):
         """Key → object, in the order of the table's."""
         things: Mapping[int, Any] = getattr(self._scene, "cubes", None) or self._scene.shape_actors
         return things
-
-    @property
-    def _planned_poses(self) -> Mapping[int, Any]:
-        """Key → where the object will appear [1, …], x and y first."""
-        scene = self._scene
-        planned: Mapping[int, Any] = getattr(scene, "_manip_raw_poses", None) or scene.initial_poses
-        return planned
 
     @property
     def _right(self) -> Any:
@@ -172,7 +159,8 @@ class Recall(SceneFacts):
 
     def _touch(self, hand: Hand, key: int) -> Actions:
         """The actions that touch an object."""
-        return touch_thing(hand, partial(_offset, hand, self._things[key]))
+        thing = self._things[key]
+        return touch_thing(hand, lambda: place_of(thing) - hand.position)
 
     def correct_choice(self) -> int:
         return list(self._things).index(self._answers[0])
@@ -185,11 +173,14 @@ class Recall(SceneFacts):
 
     def _among(self, keys: Sequence[int], right: int, time: int) -> Candidates:
         """These objects, of which one is right."""
+        scene = self._scene
         places = []
         for key in keys:
             place = place_of(self._things[key])
-            if time < self._cue_end:  # where it will appear
-                place = self._planned_poses[key][0].cpu().numpy()
+            if time < self._cue_end:
+                # Where it will appear: x and y first
+                poses = getattr(scene, "_manip_raw_poses", None) or scene.initial_poses
+                place = poses[key][0].cpu().numpy()
             places.append(place[:2].tolist())
         return Candidates(places, [keys.index(right)])
 

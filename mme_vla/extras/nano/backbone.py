@@ -412,7 +412,21 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
             lambda x_t, time: self.denoise(context, x_t, time, versions), actions, flat
         )
         loss = losses.unflatten(0, (-1, versions)).mean(1)
-        return loss + self._localization_loss(batch, context) if self.training else loss
+
+        # The localization loss is of policies that point and whose memory reads images.
+        history = batch.history
+        if (
+            not self.training
+            or self.pointer is None
+            or history is None
+            or history.features.shape[-1] != self.vision_width
+        ):
+            return loss
+        assert context.pointing is not None
+        time = torch.ones(len(batch.prompt), device=batch.prompt.device)
+        start = time.new_zeros(len(time), self.horizon, self.action_dim)
+        pointed = self.act(context, start, time, 1)
+        return loss + self.pointer.localization_loss(pointed, history, context.pointing[1])[:, None]
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
@@ -431,11 +445,9 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         context = self.read_context(batch, injection)
         x = self.head.start(noise, steps, batch.overlap)
         times = self.head.times(steps, x.device)
-
-        def clean(x: Tensor, index: int) -> Tensor:
-            return self.denoise(context, x, times[index].expand(len(x)), 1)
-
-        velocity = self.head.velocity(clean, times, noise)
+        velocity = self.head.velocity(
+            lambda x, index: self.denoise(context, x, times[index].expand(len(x)), 1), times, noise
+        )
         if batch.overlap is not None:
             velocity = rtc_guidance(velocity, batch.overlap, times)
         increments = noise.get("increments")
@@ -507,24 +519,6 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
             )
         final: Tensor = self.final(x)[0]
         return final
-
-    def _localization_loss(self, batch: Batch, context: Context) -> Tensor | float:
-        """`Pointer.localization_loss` [b, 1], of a policy that points and whose memory reads
-        images; else 0.
-        """
-        history = batch.history
-        if (
-            self.pointer is None
-            or history is None
-            or history.features.shape[-1] != self.vision_width
-        ):
-            return 0.0
-        assert context.pointing is not None
-        time = torch.ones(len(batch.prompt), device=batch.prompt.device)
-        actions = self.act(
-            context, time.new_zeros(len(time), self.horizon, self.action_dim), time, 1
-        )
-        return self.pointer.localization_loss(actions, history, context.pointing[1])[:, None]
 
     def recompute(self, mode: Recompute) -> None:
         """No effect: a layer's activations are a chunk's few tokens."""

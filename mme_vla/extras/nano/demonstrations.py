@@ -168,9 +168,8 @@ class Scene:
         Raises:
             UserError: its file is of other actions, or of motions that were not carried out alike.
         """
-        return self.failed.is_file() or (self.made and self._complete())
-
-    def _complete(self) -> bool:
+        if not self.made:
+            return self.failed.is_file()
         with np.load(self.path) as file:
             about = _about(self.path, file)
             carried_out = about["carried_out"]
@@ -322,7 +321,21 @@ class _Taken:
 
     def add(self, observed: Mapping[str, Any], info: Mapping[str, Any], in_video: bool) -> None:
         if not self._snapshots:
-            self._find_objects()  # of the scene as its episode begins
+            from sapien.render import RenderBodyComponent
+
+            # The objects of the scene as its episode begins
+            scene = self.env.scene
+            self._entities = []
+            self._bodies = []
+            for actor in scene.actors.values():
+                if actor.px_body_type == "static":
+                    continue
+                entity = actor._objs[0]
+                self._entities.append(entity)
+                body = entity.find_component_by_type(RenderBodyComponent)
+                if body is not None:
+                    self._bodies.append(body)
+            self._articulations = [each._objs[0] for each in scene.articulations.values()]
         self.texts.append(info)
         self.states.append(benchmark_state(observed["joint_state"], observed["gripper_state"]))
         self.video += in_video
@@ -330,21 +343,6 @@ class _Taken:
         visibilities = [body.visibility for body in self._bodies]
         joints = [(each.root_pose, each.qpos) for each in self._articulations]
         self._snapshots.append((poses, visibilities, joints))
-
-    def _find_objects(self) -> None:
-        from sapien.render import RenderBodyComponent
-
-        scene = self.env.scene
-        self._entities = []
-        self._bodies = []
-        for actor in scene.actors.values():
-            if actor.px_body_type != "static":
-                entity = actor._objs[0]
-                self._entities.append(entity)
-                body = entity.find_component_by_type(RenderBodyComponent)
-                if body is not None:
-                    self._bodies.append(body)
-        self._articulations = [each._objs[0] for each in scene.articulations.values()]
 
     def put_back(self, frame: int) -> None:
         """Make the scene stand as it did in a frame."""

@@ -275,10 +275,10 @@ class Decisions(Dataset[int]):
             batch = replace(batch, history=self.replay.select(rows, self.epoch))
         if self.reflection is not None:
             batch = self.reflection(batch, rows)
-        return self._noisy(batch, rows) if self.noise or self.token_noise else batch
+        if not (self.noise or self.token_noise):
+            return batch
 
-    def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:
-        # of numbers alone, so the same everywhere
+        # Noise is of the rows' numbers alone, so the same everywhere.
         generator = torch.Generator().manual_seed(seed_of("rows", *map(int, rows)))
 
         def perturbed(values: Tensor, size: float | Tensor) -> Tensor:
@@ -402,7 +402,15 @@ def _items(
     decisions = _decisions(policy, demonstration)
     cameras = policy.embodiment.camera_names
     view_tokens = torch.stack([made.at(name, decisions) for name in cameras], 1)
-    subgoals = _subgoals(policy, demonstration)[:: policy.embodiment.action.execute]
+    subgoals: Sequence[str | None] = [None] * len(decisions)
+    kind = subgoal_kind(policy)
+    if kind is not None:
+        # As the simulator says them, their points moved a little
+        noise = int(PolicySections.of(policy.config).subgoal_text["point_noise"])
+        rng = np.random.default_rng(demonstration.seed)
+        texts = demonstration.subgoals[kind.removesuffix("_subgoal")]
+        moved = [perturb_point(text, noise, rng) for text in texts]
+        subgoals = moved[:: policy.embodiment.action.execute]
     items = []
     for place, frame in enumerate(decisions):
         state = demonstration.states[frame]
@@ -462,19 +470,6 @@ def _labels(memory: Memory, demonstration: Demonstration) -> FrameLabels:
         BOUNDARY: lambda frames: np.isin(frames, begins).astype(np.float32),
     }
     return {name: known[name] for name in labels_read(memory) if name in known}
-
-
-def _subgoals(policy: MMEPolicy, demonstration: Demonstration) -> Sequence[str | None]:
-    """The subgoal of each decision as the simulator says it, its point moved a little; None where
-    none is read.
-    """
-    kind = subgoal_kind(policy)
-    if kind is None:
-        return [None] * len(demonstration.motions.decisions)
-    noise = int(PolicySections.of(policy.config).subgoal_text["point_noise"])
-    rng = np.random.default_rng(demonstration.seed)
-    texts = demonstration.subgoals[kind.removesuffix("_subgoal")]
-    return [perturb_point(text, noise, rng) for text in texts]
 
 
 def _stack(items: Sequence[dict[str, Any]]) -> Batch:

@@ -216,11 +216,12 @@ def pretrain(
         scenes: to learn from.
         folder: of the run.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import load_file, save_file
 
     weights_file, draft = folder / "nano_tower.safetensors", folder / "draft.pt"
     if weights_file.is_file():
-        load_tower(tower, weights_file)
+        learned = load_file(weights_file)
+        tower.load_state_dict({name: value.float() for name, value in learned.items()})
         return weights_file
     folder.mkdir(parents=True, exist_ok=True)
     weights, frequencies = scenes.weights()
@@ -259,13 +260,6 @@ def pretrain(
     with write_atomically(weights_file) as path:
         save_file(state, path)
     return weights_file
-
-
-def load_tower(tower: PlaceTower, file: Path) -> None:
-    """Give a tower the weights that `pretrain` wrote."""
-    from safetensors.torch import load_file
-
-    tower.load_state_dict({name: value.float() for name, value in load_file(file).items()})
 
 
 def _batch_loss(

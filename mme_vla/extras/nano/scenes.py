@@ -74,7 +74,14 @@ def find_places(env: "Task") -> list[Place]:
 
 def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
     yield "hand", env.tcp_pose.p, [int(link.per_scene_id[0]) for link in env.agent.robot.links]
-    lit = list(_lit_discs(env))
+    # Discs that mark or highlight something now; they are no things of a task.
+    lit = []
+    for name, actor in env.scene.actors.items():
+        kind = "highlight" if name.startswith("highlight") else "mark"
+        if name.startswith(("highlight", "mark", "disc_red")):
+            disc = Thing(name, actor)
+            if disc.position[2] > UNDER_THE_FLOOR:
+                lit.append((kind, disc))
     lit_discs = [disc for _, disc in lit]
     is_grasping = GRASP[0] < float(env.fingers.mean()) < GRASP[1]
     for thing in env.things:
@@ -123,16 +130,6 @@ def _class_of(thing: Any) -> str:
         return "disc" if thing.name.startswith("disc") else "target"
     types = {Container: "container", Button: "button", Board: "board", Peg: "peg end"}
     return types.get(type(thing)) or thing.name.partition("_")[0]  # box, obstacle
-
-
-def _lit_discs(env: "Task") -> Iterator[tuple[str, Any]]:
-    """The discs that mark or highlight something now; they are no things of a task."""
-    for name, actor in env.scene.actors.items():
-        kind = "highlight" if name.startswith("highlight") else "mark"
-        if name.startswith(("highlight", "mark", "disc_red")):
-            disc = Thing(name, actor)
-            if disc.position[2] > UNDER_THE_FLOOR:
-                yield kind, disc
 
 
 def visible_places(places: Sequence[Place], segmentation: np.ndarray) -> np.ndarray:

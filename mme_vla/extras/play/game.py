@@ -198,8 +198,27 @@ class ChoiceSession:
         if label not in options:
             raise UserError(f"There is no option {choice!r}. {did_you_mean(label, options)}")
         option = options[label]
-        point = checked_point(action.get("point"), option) if option.needs_point else None
-        return option, point
+        if not option.needs_point:
+            return option, None
+
+        # The point is a pixel (row, column) of the front image.
+        point = action.get("point")
+        try:
+            values = np.asarray([] if point is None else point, np.float64)
+        except (TypeError, ValueError):
+            values = np.empty(1)
+        problem = ""
+        if not values.size:
+            problem = "needs a point: the pixel [row, column] of the object meant"
+        elif values.shape != (2,) or not np.isfinite(values).all():
+            problem = f"needs two numbers as its point, a pixel's row and column; got {point!r}"
+        elif not ((values >= 0) & (values < SIDE)).all():
+            problem = (
+                f"needs a point of the image, and {point} lies outside of the image: 0 to"
+                f" {SIDE - 1}"
+            )
+        require(not problem, f"Option {option.label!r} ({option.action}) {problem}.")
+        return option, (float(values[0]), float(values[1]))
 
     def give_up(self, outcome: str, reason: str) -> None:
         """End the episode without the environment. outcome: what it counts as. reason: why, kept in
@@ -318,23 +337,3 @@ class ChoiceSession:
                     options.append(Option(label, str(option["action"]), needs_point))
             self.options = tuple(options)
         self._displayed_at = self._clock()
-
-
-def checked_point(point: Any, option: Option) -> tuple[float, float]:
-    """A pixel (row, column) of the front image."""
-    what = f"Option {option.label!r} ({option.action})"
-    try:
-        values = np.asarray([] if point is None else point, np.float64)
-    except (TypeError, ValueError):
-        values = np.empty(1)
-    problem = ""
-    if not values.size:
-        problem = "needs a point: the pixel [row, column] of the object meant"
-    elif values.shape != (2,) or not np.isfinite(values).all():
-        problem = f"needs two numbers as its point, a pixel's row and column; got {point!r}"
-    elif not ((values >= 0) & (values < SIDE)).all():
-        problem = (
-            f"needs a point of the image, and {point} lies outside of the image: 0 to {SIDE - 1}"
-        )
-    require(not problem, f"{what} {problem}.")
-    return float(values[0]), float(values[1])

@@ -57,41 +57,39 @@ class PolicyPlayer(Player):
         self._n_executed = 0
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        assert self._running is not None
+        running = self._running
+        assert running is not None
         space = self.policy.embodiment.action
         self._frames.add(session.observation)
         if not self._actions:
-            self._observe(session, self._running)
-            chunk = self.policy.act(self._running.episode)
-            failure = self._running.episode.failure
+            # The policy reads the frames since its last chunk, and chooses the next one.
+            frames = self._frames.observation()
+            self._frames = Frames(self.policy.embodiment)
+            report = Report(
+                goal=session.goal,
+                options=session.info.get(OPTIONS),
+                executed=self._n_executed,
+                frames=len(frames["state"]),
+            )
+            running.take_report(report)
+            if running.chunks == 0:
+                running.begin(frames)
+            else:
+                running.resume(frames)
+            running.read()
+            while running.pieces:
+                running.read()
+            chunk = self.policy.act(running.episode)
+            failure = running.episode.failure
             if failure is not None:
                 raise NoChoiceError("error", failure.reason)
-            self._running.set_actions(chunk[: space.execute])
+            running.set_actions(chunk[: space.execute])
             self._actions = list(chunk[: space.execute])
             self._n_executed = len(self._actions)
         action = benchmark_action(space, self._actions.pop(0))
         assert isinstance(action, dict)
         point = [min(value, SIDE - 1) for value in action["point"]]  # a share of 1 is the last
         return {"choice": action["choice"], "point": point}, {}
-
-    def _observe(self, session: ChoiceSession, running: RunningEpisode) -> None:
-        """Have the policy read the frames since its last chunk."""
-        frames = self._frames.observation()
-        self._frames = Frames(self.policy.embodiment)
-        report = Report(
-            goal=session.goal,
-            options=session.info.get(OPTIONS),
-            executed=self._n_executed,
-            frames=len(frames["state"]),
-        )
-        running.take_report(report)
-        if running.chunks == 0:
-            running.begin(frames)
-        else:
-            running.resume(frames)
-        running.read()
-        while running.pieces:
-            running.read()
 
     def close(self) -> None:
         self._end_episode()

@@ -54,25 +54,6 @@ def choice_text(decision: Decision) -> str:
     return text
 
 
-def full_question(
-    goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = ""
-) -> str:
-    """One question that tells the whole episode, `<video>` and `<image>` where images go.
-
-    goal: the task in words.
-    clips: what each clip that was shown is, in order, and whether it has frames.
-    complaint: why the last reply to the same question could not be used; empty the first time.
-    """
-    lines = [f"The task: {goal}"]
-    for title, has_frames in clips:
-        lines.append(f"{title}: {VIDEO if has_frames else 'nothing moved.'}")
-    lines += [f"The present image: {IMAGE}", "Options:", option_list(options)]
-    if complaint:
-        lines.append(complaint)
-    lines.append("What next?")
-    return "\n".join(lines)
-
-
 def opening(goal: str, options: Sequence[Option], video: bool) -> str:
     """The first question of a conversation."""
     introduction = "This is the present image."
@@ -248,22 +229,30 @@ class QwenPlayer(ModelPlayer):
         return completion.text
 
     def question(self, session: ChoiceSession, complaint: str = "") -> Question:
-        """What is asked now."""
+        """One question that tells the whole episode, `<video>` and `<image>` where images go.
+
+        complaint: why the last reply to the same question could not be used; empty the first time.
+        """
         first, *motions = session.reveals
         titled_clips: list[tuple[str, list[np.ndarray]]] = []
         if len(first.frames) > 1:
             titled_clips.append(("The video that comes before you act", list(first.frames[:-1])))
         for reveal, decision in zip(motions, session.decisions, strict=True):
             titled_clips.append((f"You chose {choice_text(decision)}", list(reveal.frames)))
-        titles: list[tuple[str, bool]] = []
+        lines = [f"The task: {session.goal}"]
         clips: list[Clip] = []
         for title, frames in titled_clips:
-            titles.append((title, bool(frames)))
-            if frames:
-                indices = sample_video(len(frames), most=self.clip_frames)
-                clips.append(Clip(np.stack([frames[i] for i in indices]), indices, len(frames)))
-        user = full_question(session.goal, session.options, titles, complaint)
-        return Question(SYSTEM, user, [session.frame], clips)
+            if not frames:
+                lines.append(f"{title}: nothing moved.")
+                continue
+            lines.append(f"{title}: {VIDEO}")
+            indices = sample_video(len(frames), most=self.clip_frames)
+            clips.append(Clip(np.stack([frames[i] for i in indices]), indices, len(frames)))
+        lines += [f"The present image: {IMAGE}", "Options:", option_list(session.options)]
+        if complaint:
+            lines.append(complaint)
+        lines.append("What next?")
+        return Question(SYSTEM, "\n".join(lines), [session.frame], clips)
 
 
 @PLAYERS.register("openai")
@@ -295,7 +284,17 @@ class OpenAIPlayer(ModelPlayer):
     def ask(self, session: ChoiceSession, complaint: str) -> str:
         message: Message = ("user", [complaint])
         if not complaint:
-            message = ("user", self._news(session))
+            # The frames since the last decision, then the present one
+            if session.decisions:
+                frames = list(session.reveals[-1].frames)
+                text = following(session.decisions[-1], session.options, len(frames) > 0)
+            else:
+                frames = list(session.reveals[0].frames[:-1])
+                text = opening(session.goal, session.options, len(frames) > 0)
+            parts: list[str | MediaPart] = [MediaPart(session.frame), text]
+            if frames:
+                parts.insert(0, MediaPart(np.stack(frames)))
+            message = ("user", parts)
         elif self._unanswered is not None:
             message = self._unanswered
         self._unanswered = None
@@ -313,18 +312,6 @@ class OpenAIPlayer(ModelPlayer):
             raise NoChoiceError(outcome, f"no answer ({failure.problem}): {failure}") from None
         self._conversation += [message, ("model", [reply.text])]
         return reply.text
-
-    def _news(self, session: ChoiceSession) -> list[str | MediaPart]:
-        if session.decisions:
-            frames = list(session.reveals[-1].frames)
-            text = following(session.decisions[-1], session.options, len(frames) > 0)
-        else:
-            frames = list(session.reveals[0].frames[:-1])
-            text = opening(session.goal, session.options, len(frames) > 0)
-        parts: list[str | MediaPart] = []
-        if frames:
-            parts.append(MediaPart(np.stack(frames)))
-        return [*parts, MediaPart(session.frame), text]
 
 
 @PLAYERS.register("gemini")

@@ -296,7 +296,14 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
     table = {}
     for label, outcomes in arms.items():
         table[label] = {key: matched[key] - outcomes[key] for key in keys}
-    sampled = dict(zip(table, _bootstrap(list(table.values())), strict=True))
+    # Means over tasks of scenes resampled within each task, the same ones for all arms
+    sampled = {}
+    if table:
+        tables = [_by_task(differences) for differences in table.values()]
+        tasks = {}
+        for task in tables[0]:
+            tasks[task] = [of_arm[task][:, None] for of_arm in tables]
+        sampled = dict(zip(table, resampled_means(tasks, _SAMPLES, seed=0), strict=True))
     losses = {}
     for label, differences in table.items():
         loss = _mean(differences)
@@ -440,19 +447,6 @@ def _by_task(values: Outcomes) -> dict[str, np.ndarray]:
     for key, value in values.items():
         tasks.setdefault(key.task, []).append(value)
     return {task: np.array(of_task) for task, of_task in tasks.items()}
-
-
-def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
-    """Means over tasks of scenes resampled within each task, the same ones for all columns:
-    [columns, samples].
-    """
-    if not columns:
-        return np.zeros((0, _SAMPLES))
-    tables = [_by_task(column) for column in columns]
-    tasks = {}
-    for task in tables[0]:
-        tasks[task] = [table[task][:, None] for table in tables]
-    return resampled_means(tasks, _SAMPLES, seed=0)
 
 
 def _writing(policy: Policy, plan: ProbePlan, name: str) -> dict[str, Any] | str:

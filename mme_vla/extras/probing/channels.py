@@ -85,13 +85,6 @@ class Remembered:
         return ages
 
 
-def same_progress(slots: Sequence[int], count: int) -> np.ndarray:
-    """For each of some slots in a row, the slot of another store of `count` entries that stands as
-    far along.
-    """
-    return np.linspace(0, max(count - 1, 0), max(len(slots), 1)).round().astype(int)[: len(slots)]
-
-
 Place = tuple[History, int]  # A frame of a history
 
 

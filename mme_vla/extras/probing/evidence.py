@@ -89,27 +89,25 @@ def _record_demonstration(
                 images[len(states)] = image
             states.append(np.asarray(frame["state"], np.float32))
             video += in_video
-        facts = _within(env.facts, len(states))
+        all_facts = env.facts
         success = env.success
     finally:
         env.close()
     if not success:
         return None
-    boundaries = np.array([video], np.int64)
-    return EvidenceEpisode(
-        spec.task, spec.episode, len(states), video, facts, boundaries, np.stack(states), images
-    )
 
-
-def _within(facts: Sequence[Fact], length: int) -> list[Fact]:
-    """The facts of the first so many frames: no policy sees the frame after the last action."""
-    within = []
-    for fact in facts:
+    # No policy sees the frame after the last action.
+    length = len(states)
+    facts = []
+    for fact in all_facts:
         first, last = fact.frames
         needed = tuple(frame for frame in fact.needed if frame < length)
         if first < length:
-            within.append(replace(fact, frames=(first, min(last, length - 1)), needed=needed))
-    return within
+            facts.append(replace(fact, frames=(first, min(last, length - 1)), needed=needed))
+    boundaries = np.array([video], np.int64)
+    return EvidenceEpisode(
+        spec.task, spec.episode, length, video, facts, boundaries, np.stack(states), images
+    )
 
 
 def _record_robomme(spec: EpisodeSpec, rendered: Container[int]) -> EvidenceEpisode | None:

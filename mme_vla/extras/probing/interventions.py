@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.errors import UserError, counted
-from mme_vla.extras.probing.channels import Remembered, same_progress
+from mme_vla.extras.probing.channels import Remembered
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.memory.history import History
 from mme_vla.memory.perturbation import Perturbation
@@ -150,8 +150,9 @@ class Swap(Perturbation):
         donor = moment.donor(store.name)
         if not donor.occupied or not occupied:
             return store
-        # Paired over all entries, so that a part of them is swapped as it would be among all.
-        pairs = same_progress(occupied, len(donor.occupied)).tolist()
+        # Each is paired with what stands as far along the donor, over all entries, so that a part
+        # of them is swapped as it would be among all.
+        pairs = np.linspace(0, len(donor.occupied) - 1, len(occupied)).round().astype(int).tolist()
         slot_of_donor = {slot: donor.occupied[at] for slot, at in zip(occupied, pairs, strict=True)}
         slots = sorted(moment.rng.permutation(occupied)[: self.count].tolist())
         contents = [_content(donor, slot_of_donor[slot]) for slot in slots]

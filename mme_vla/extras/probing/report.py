@@ -26,7 +26,6 @@ from mme_vla.utils.pages import render
 from mme_vla.utils.style import COLOURS, FAINT, INK, figure, legend, rgb, svg
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from PIL.Image import Image
 
 
@@ -139,23 +138,6 @@ def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
         if word != "…" or shared[-1:] != ["…"]:
             shared.append(word)
     return f"{name}: {' '.join(shared)}"
-
-
-def checkpoints_table(findings: dict[str, Findings]) -> Table:
-    """One row a checkpoint: what it takes from its memory."""
-    rows = []
-    for name, checkpoint in findings.items():
-        arms = checkpoint.arms()
-        cells = [show(arms.get(arm)) for arm, _ in MEASURES.values()]
-        reach, video = checkpoint.reach(), checkpoint.from_video()
-        cells.append("–" if reach is None else f"{reach:.0f}")
-        cells.append("–" if video is None else f"{100 * video:.0f} %")
-        rows.append([name, *cells])
-    return Table(
-        "What is taken from memory",
-        ("checkpoint", *MEASURES, "reach (frames)", "from the video"),
-        rows,
-    )
 
 
 def measures_table(findings: Findings, explained: bool = False) -> Table:
@@ -316,38 +298,28 @@ def dials(findings: Findings) -> list[Section]:
     sections = []
     for name, points in findings.families().items():
         dial = _DIALS.get(name, Dial(f"More of {name}", name, False))
+        of_family = [line for line in findings.moments if line.arm.partition(":")[0] == name]
+        places: list[float] = []
+        means: list[float] = []
+        if dial.neutral:
+            places.append(0)
+            means.append(0)
         with figure((5.6, 3.0)) as (canvas, (axes,)):
-            _plot_dial(axes, findings, name, points, dial)
+            for place, effect_of in points:
+                lines = [line for line in of_family if line.dial == place]
+                values = [episode.change for episode in by_recording(lines)]
+                axes.plot([place] * len(values), values, "o", color=INK, ms=3, alpha=0.5, lw=0)
+                places.append(place)
+                means.append(effect_of.change)
+            axes.plot(places, means, "-o", color=COLOURS[0], ms=5)
+            axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
+            axes.set_ylim(bottom=0)
+            axes.set_xlabel(dial.axis)
+            axes.set_ylabel("change of the actions")
             svg_text = svg(canvas)
         caption = "A dot: one recorded episode. Dashed: the policy's own spread."
         sections.append(Section(dial.title, svg_text, caption=caption))
     return sections
-
-
-def _plot_dial(
-    axes: "Axes",
-    findings: Findings,
-    name: str,
-    points: Sequence[tuple[float, Effect]],
-    dial: Dial,
-) -> None:
-    of_family = [line for line in findings.moments if line.arm.partition(":")[0] == name]
-    places: list[float] = []
-    means: list[float] = []
-    if dial.neutral:
-        places.append(0)
-        means.append(0)
-    for place, effect_of in points:
-        lines = [line for line in of_family if line.dial == place]
-        values = [episode.change for episode in by_recording(lines)]
-        axes.plot([place] * len(values), values, "o", color=INK, ms=3, alpha=0.5, lw=0)
-        places.append(place)
-        means.append(effect_of.change)
-    axes.plot(places, means, "-o", color=COLOURS[0], ms=5)
-    axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel(dial.axis)
-    axes.set_ylabel("change of the actions")
 
 
 PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
@@ -554,10 +526,20 @@ def _offline_sections(findings: Findings, meanings: Mapping[str, str]) -> list[S
 
 def table_of(findings: Mapping[str, Findings]) -> str:
     """Several checkpoints beside each other, in Markdown, and what the columns mean."""
+    rows = []
+    for name, checkpoint in findings.items():
+        arms = checkpoint.arms()
+        cells = [show(arms.get(arm)) for arm, _ in MEASURES.values()]
+        reach, video = checkpoint.reach(), checkpoint.from_video()
+        cells.append("–" if reach is None else f"{reach:.0f}")
+        cells.append("–" if video is None else f"{100 * video:.0f} %")
+        rows.append([name, *cells])
+    columns = ("checkpoint", *MEASURES, "reach (frames)", "from the video")
+    table = Table("What is taken from memory", columns, rows)
     terms = [f"- {name}: {question}" for name, (_, question) in MEASURES.items()]
     for name, meaning in (REACH, FROM_VIDEO):
         terms.append(f"- {name}: {meaning}")
-    return "\n".join([to_markdown(checkpoints_table(dict(findings))), *terms, "", UNITS])
+    return "\n".join([to_markdown(table), *terms, "", UNITS])
 
 
 def _encoded(path: Path) -> str:

@@ -193,7 +193,18 @@ def _on_recordings(
     options: RunOptions,
 ) -> None:
     policy.require_processor().require_stats()
-    claim_run(folder, _settings(policy, plan, facts, arms))
+    # What decides the lines, as `run.json` keeps it
+    sources = {id(r.source): r.source for r in [*plan.recordings, *plan.lend]}
+    decisive = {
+        "model": facts.model,
+        "checkpoint": facts.checkpoint,
+        "policy": fingerprint(dict(policy.config)),
+        "arms": {arm.name: options_of(arm) for arm in arms},
+        "data": {source.name: source.fingerprint for source in sources.values()},
+        "recordings": [recording.name for recording in plan.recordings],
+        **asdict(plan.offline),
+    }
+    claim_run(folder, decisive)
     shard = options.shard
     local = list(plan.recordings)[shard.index :: shard.count]
     path = folder / "offline.jsonl"
@@ -205,22 +216,6 @@ def _on_recordings(
         else nullcontext(lambda _: None) as advance
     ):
         probe_offline(policy, arms, local, plan.lend, path, plan.offline, advance)
-
-
-def _settings(
-    policy: Policy, plan: ProbePlan, facts: RunFacts, arms: Sequence[Arm]
-) -> dict[str, Any]:
-    """What decides the lines, as `run.json` keeps it."""
-    sources = {id(r.source): r.source for r in [*plan.recordings, *plan.lend]}
-    return {
-        "model": facts.model,
-        "checkpoint": facts.checkpoint,
-        "policy": fingerprint(dict(policy.config)),
-        "arms": {arm.name: options_of(arm) for arm in arms},
-        "data": {source.name: source.fingerprint for source in sources.values()},
-        "recordings": [recording.name for recording in plan.recordings],
-        **asdict(plan.offline),
-    }
 
 
 def probed_folder(folder: Path) -> Findings:

@@ -131,11 +131,6 @@ def share_correct(candidates: Candidates, start: Sequence[float], end: Sequence[
     return float(np.isin(tied, candidates.correct).mean())
 
 
-def chance_of(candidates: Candidates) -> float:
-    """The share of guesses that are correct."""
-    return len(candidates.correct) / len(candidates.places)
-
-
 def check_pair(first: Decision, second: Decision) -> None:
     """Make sure that two scenes differ in what is correct alone.
 
@@ -206,7 +201,10 @@ class TwinScenes:
                     shares[arm] *= self._score(scene, decision, chunk)
         except (NoPairError, SceneError) as error:
             return TwinLine(job.task, job.episode, left_out=text_of(error))
-        chance = chance_of(pair[0].candidates) * chance_of(pair[1].candidates)
+        chance = 1.0
+        for decision in pair:
+            # The share of guesses that are correct
+            chance *= len(decision.candidates.correct) / len(decision.candidates.places)
         return TwinLine(job.task, job.episode, len(pair[0].candidates.places), chance, shares)
 
     def _decide(self, spec: EpisodeSpec, job: Job) -> Decision:

@@ -192,8 +192,16 @@ class Writing:
         """
         rows = {}
         for task, episodes in self.tasks.items():
-            operations = self.operations.get(task, ())
-            rows[task] = _row(episodes) | _operations_row(operations, self.budget)
+            row: dict[str, Any] = {}
+            for name in ("precision", "recall", "score", "chance"):
+                row[name] = float(np.mean([getattr(episode, name) for episode in episodes]))
+            lags = np.concatenate([episode.lags for episode in episodes])
+            facts = sum(episode.facts for episode in episodes)
+            row["lag"] = float(lags.mean()) if len(lags) else None
+            row["held"] = len(lags) / facts
+            row["facts"] = facts
+            row["episodes"] = len(episodes)
+            rows[task] = row | _operations_row(self.operations.get(task, ()), self.budget)
         mean: dict[str, Any] = {}
         for name in next(iter(rows.values()), {}):
             values = [row[name] for row in rows.values() if row[name] is not None]
@@ -203,19 +211,6 @@ class Writing:
             elif values:
                 mean[name] = float(np.mean(values))
         return {"tasks": rows, "mean": mean}
-
-
-def _row(episodes: Sequence[EpisodeWriting]) -> dict[str, Any]:
-    row: dict[str, Any] = {}
-    for name in ("precision", "recall", "score", "chance"):
-        row[name] = float(np.mean([getattr(episode, name) for episode in episodes]))
-    lags = np.concatenate([episode.lags for episode in episodes])
-    facts = sum(episode.facts for episode in episodes)
-    row["lag"] = float(lags.mean()) if len(lags) else None
-    row["held"] = len(lags) / facts
-    row["facts"] = facts
-    row["episodes"] = len(episodes)
-    return row
 
 
 def _operations_row(episodes: Sequence[Operations], budget: int | None) -> dict[str, float | None]:

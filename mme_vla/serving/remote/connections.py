@@ -108,18 +108,14 @@ class HttpConnection:
             _shut(self._http.sock)
         self._http.close()
 
-    def _open(self) -> socket.socket:
-        """The open socket, whose time-out is no longer that of the connection."""
-        if self._http.sock is None:
-            self._http.connect()
-        self._http.sock.settimeout(self._timeout)
-        return self._http.sock
-
     def _exchange(self, method: str, path: str, body: bytes | None) -> dict[str, Any]:
         late = threading.Event()
         is_open = False
         try:
-            stream = self._open()
+            if self._http.sock is None:
+                self._http.connect()
+            stream = self._http.sock
+            stream.settimeout(self._timeout)
             is_open = True
             # The socket's time-out is that of one read, and a byte now and then is within it.
             watch = threading.Timer(self._timeout, _shut, (stream, late))

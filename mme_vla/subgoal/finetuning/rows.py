@@ -248,7 +248,18 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         height, width, _ = read_image(inside(self.folder, example, "picture")).shape
         n_tokens = round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE)
         n_tokens = min(max(n_tokens, 4), IMAGE_TOKENS)
-        self.rows = [row for row in rows if _most_tokens(row, tokenizer, n_tokens) <= max_length]
+        # An image, and each pair of video frames, stands between two marks.
+        video_tokens = VIDEO_FRAMES // 2 * (VIDEO_TOKENS + _TIME + 2)
+        self.rows = []
+        for row in rows:
+            # An upper bound of the row's tokens, without reading its images
+            total = _MARKS
+            for text in texts_of(row):
+                total += len(tokenizer.encode(text, add_special_tokens=False))
+            total += len(row.get("images", [])) * (n_tokens + 2)
+            total += len(row.get("videos", [])) * video_tokens
+            if total <= max_length:
+                self.rows.append(row)
         self.left_out = len(rows) - len(self.rows)
         require(self.rows, f"All rows of {file} are longer than max_length={max_length}; raise it.")
 
@@ -319,15 +330,3 @@ def hf_dataset(file: str | Path) -> Any:
         videos=List(Value("string")),
     )
     return Dataset.from_dict(columns, features=features)
-
-
-def _most_tokens(row: Row, tokenizer: Any, image_tokens: int) -> int:
-    """Return an upper bound of the row's tokens, without reading its images."""
-    total = _MARKS
-    for text in texts_of(row):
-        total += len(tokenizer.encode(text, add_special_tokens=False))
-    # An image, and each pair of video frames, stands between two marks.
-    video_tokens = VIDEO_FRAMES // 2 * (VIDEO_TOKENS + _TIME + 2)
-    total += len(row.get("images", [])) * (image_tokens + 2)
-    total += len(row.get("videos", [])) * video_tokens
-    return total

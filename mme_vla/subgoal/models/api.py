@@ -134,16 +134,17 @@ class MediaPart:
 
     def content(self, video_frames: int) -> list[dict[str, Any]]:
         """Return the parts of a message: the image, or images sampled from the video."""
-        if video_frames not in self._content:
-            self._content[video_frames] = self._encode(video_frames)
-        return self._content[video_frames]
-
-    def _encode(self, video_frames: int) -> list[dict[str, Any]]:
+        if video_frames in self._content:
+            return self._content[video_frames]
         if self.pixels.ndim == 3:
-            return [_image_part(self.pixels)]
-        indices = sample_video(len(self.pixels), most=video_frames)
-        caption = f"A video of {len(self.pixels)} frames; {len(indices)} of them in order:"
-        return [_text_part(caption), *(_image_part(self.pixels[i]) for i in indices)]
+            parts = [_image_part(self.pixels)]
+        else:
+            indices = sample_video(len(self.pixels), most=video_frames)
+            caption = f"A video of {len(self.pixels)} frames; {len(indices)} of them in order:"
+            parts = [{"type": "text", "text": caption}]
+            parts += [_image_part(self.pixels[i]) for i in indices]
+        self._content[video_frames] = parts
+        return parts
 
 
 Message = tuple[str, Sequence[str | MediaPart]]
@@ -387,7 +388,7 @@ def chat_messages(
             if isinstance(part, MediaPart):
                 content += part.content(video_frames)
             else:
-                content.append(_text_part(part))
+                content.append({"type": "text", "text": part})
         converted.append({"role": role, "content": content})
     return converted
 
@@ -420,10 +421,6 @@ def _token_count(usage: Any, name: str) -> int:
     if type(count) is not int or not 0 <= count < MOST_TOKENS:
         return 0
     return count
-
-
-def _text_part(text: str) -> dict[str, Any]:
-    return {"type": "text", "text": text}
 
 
 def _image_part(pixels: np.ndarray) -> dict[str, Any]:

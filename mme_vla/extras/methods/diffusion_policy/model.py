@@ -6,7 +6,8 @@ Module names inside are those of the authors' checkpoints.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,10 +17,6 @@ from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.errors import missing_extra, require
 from mme_vla.extras.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.speed import Recompute, run_layer
-
-if TYPE_CHECKING:
-    from torch.nn import GroupNorm
-
 
 Schedule = Any
 """A `diffusers.DDPMParallelScheduler`, imported only where it is used."""
@@ -96,11 +93,10 @@ def build_image_encoder() -> nn.Sequential:
         from torchvision.models import resnet18
     except ImportError:
         raise missing_extra("Diffusion Policy", "baselines") from None
-
-    def norm(channels: int) -> "GroupNorm":
-        return nn.GroupNorm(channels // 16, channels)
-
-    return nn.Sequential(*list(resnet18(weights=None, norm_layer=norm).children())[:8])
+    network = resnet18(
+        weights=None, norm_layer=lambda channels: nn.GroupNorm(channels // 16, channels)
+    )
+    return nn.Sequential(*list(network.children())[:8])
 
 
 def cell_centres(height: int, width: int, device: torch.device | None = None) -> Tensor:
@@ -217,10 +213,9 @@ class ConditionalUnet1d(nn.Module):
             nn.Mish(),
             nn.Linear(4 * step_width, step_width),
         )
-
-        def unit(channels: int, out: int) -> ConditionedUnit:
-            return ConditionedUnit(channels, out, step_width + condition, kernel, groups)
-
+        unit = partial(
+            ConditionedUnit, condition=step_width + condition, kernel=kernel, groups=groups
+        )
         last = widths[-1]
         self.mid_modules = nn.ModuleList([unit(last, last), unit(last, last)])
         levels = list(zip([action_dim, *widths[:-1]], widths, strict=True))

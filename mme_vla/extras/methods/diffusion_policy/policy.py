@@ -100,9 +100,16 @@ class DiffusionPolicy(NetworkPolicy):
             raise missing_extra("Diffusion Policy", "baselines")
         sections = PolicySections.of(config)
         sizes, robot = DiffusionSizes.from_dict(sections.backbone), embodiment_of(config)
-        integration = None
+        integration: PooledIntegration | None = None
         if sections.integration:
-            integration = _pooled(sections.integration, sizes)
+            name = sections.integration.get("name", "")
+            kind = INTEGRATIONS[name]
+            if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
+                raise UserError(
+                    f"Diffusion Policy has no place for what the integration {name!r} brings:"
+                    " memory reaches it as one vector. Choose integration=film."
+                )
+            integration = INTEGRATIONS.build(sections.integration, sizes)
         mismatch = ""
         if sections.memory and integration is None:
             mismatch = "a memory without an integration"
@@ -313,16 +320,3 @@ class DiffusionPolicy(NetworkPolicy):
     def warm_up_vision(self) -> None:
         side = self.sizes.memory_tower.image_size
         self.backbone.vision(torch.zeros(1, 3, side, side, device=self.device))
-
-
-def _pooled(section: Mapping[str, Any], sizes: DiffusionSizes) -> PooledIntegration:
-    """The integration of a configuration, which must hand memory over as one vector."""
-    name = section.get("name", "")
-    kind = INTEGRATIONS[name]
-    if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
-        raise UserError(
-            f"Diffusion Policy has no place for what the integration {name!r} brings:"
-            " memory reaches it as one vector. Choose integration=film."
-        )
-    built: PooledIntegration = INTEGRATIONS.build(section, sizes)
-    return built

@@ -152,9 +152,8 @@ class Dit(nn.Module):
         self.blocks = nn.ModuleList(DitBlock(width, config.num_heads) for _ in range(config.depth))
         self.norm = nn.LayerNorm(width, eps=EPS, elementwise_affine=False)
         self.output = nn.Linear(width, action_dim)
-        self._draw(config.perceptual_init)
 
-    def _draw(self, perceptual: str) -> None:
+        # Fresh weights
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -168,7 +167,7 @@ class Dit(nn.Module):
             cross: nn.MultiheadAttention = block.cross  # type: ignore[assignment]
             assert cross.in_proj_weight is not None and cross.in_proj_bias is not None
             nn.init.zeros_(cross.in_proj_bias)
-            if perceptual == "zero":
+            if config.perceptual_init == "zero":
                 nn.init.zeros_(cross.in_proj_weight)
 
     def tokens(

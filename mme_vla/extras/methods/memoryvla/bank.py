@@ -96,7 +96,15 @@ class EpisodeBank(MemoryBank):
             return BankState(entries, times)
         if self.consolidation == "fifo":
             return BankState(entries[1:], times[1:])
-        return _merge(entries, times)
+        # The two neighbours that are most alike become their mean, at the earlier's time.
+        alike = functional.cosine_similarity(entries[:-1], entries[1:], dim=-1).mean(-1)
+        i = int((alike == alike.max()).nonzero()[0])
+        merged = (entries[i : i + 1] + entries[i + 1 : i + 2]) / 2
+        return BankState(
+            entries=torch.cat([entries[:i], merged, entries[i + 2 :]]),
+            times=torch.cat([times[: i + 1], times[i + 2 :]]),
+            merged=i,
+        )
 
     def run(
         self,
@@ -134,15 +142,3 @@ class EpisodeBank(MemoryBank):
             fused_indices.append(indices)
         order = torch.cat(fused_indices).argsort()
         return torch.cat(fused)[order], banks
-
-
-def _merge(entries: Tensor, times: Tensor) -> BankState:
-    """Merge the two neighbours that are most alike into their mean, at the earlier's time."""
-    alike = functional.cosine_similarity(entries[:-1], entries[1:], dim=-1).mean(-1)
-    i = int((alike == alike.max()).nonzero()[0])
-    merged = (entries[i : i + 1] + entries[i + 1 : i + 2]) / 2
-    return BankState(
-        entries=torch.cat([entries[:i], merged, entries[i + 2 :]]),
-        times=torch.cat([times[: i + 1], times[i + 2 :]]),
-        merged=i,
-    )

@@ -203,7 +203,8 @@ class KeyframeEpisode(Episode):
     def resume_from(self, twin: Episode) -> None:
         assert isinstance(twin, KeyframeEpisode) and twin.awaiting is not None
         newest = twin.awaiting.maps[-1]  # the others are not what this episode saw
-        self.decided(BankState((*self.remembered.maps, newest)[-self._policy.most_remembered :]))
+        maps = (*self.remembered.maps, newest)
+        self.decided(BankState(maps[-self._policy.backbone.sizes.remembered :]))
 
     def _scene_inputs(self, shots: list[Shot], finger: float, place: int) -> SceneInputs:
         processor = self._policy.require_processor()

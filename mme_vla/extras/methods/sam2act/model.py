@@ -31,14 +31,16 @@ class ConvexUp(nn.Module):
         super().__init__()
         inner = 2 * wide
         self.net_out = nn.Sequential(
-            _around(wide, inner),
+            nn.Conv2d(wide, inner, 3, padding=1),
             nn.ReLU(),
-            _around(inner, inner),
+            nn.Conv2d(inner, inner, 3, padding=1),
             nn.ReLU(),
-            _around(inner, narrow),
+            nn.Conv2d(inner, narrow, 3, padding=1),
         )
         self.net_mask = nn.Sequential(
-            _around(wide, inner), nn.ReLU(), nn.Conv2d(inner, _NEIGHBOURS * self.RATIO**2, 1)
+            nn.Conv2d(wide, inner, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(inner, _NEIGHBOURS * self.RATIO**2, 1),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -65,10 +67,6 @@ class ChannelNorm(nn.LayerNorm):
     def forward(self, x: Tensor) -> Tensor:
         """Normalise."""
         return torch.movedim(super().forward(torch.movedim(x, 1, -1)), -1, 1)
-
-
-def _around(wide: int, narrow: int) -> nn.Conv2d:
-    return nn.Conv2d(wide, narrow, 3, padding=1)
 
 
 SLOPE = 0.02

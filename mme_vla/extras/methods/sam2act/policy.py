@@ -224,11 +224,6 @@ class SAM2ActPolicy(NetworkPolicy):
         self._info = info
 
     @property
-    def most_remembered(self) -> int:
-        """Keyframes that are read, and kept."""
-        return self.backbone.sizes.remembered
-
-    @property
     def cube(self) -> Cube:
         """The workspace of the processor, else of the configuration."""
         if self.processor is not None:
@@ -391,6 +386,4 @@ class SAM2ActPolicy(NetworkPolicy):
         self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))
 
 
-@lru_cache(maxsize=2)
-def _point_finder(side: int, device: torch.device) -> PointFinder:
-    return PointFinder(side, device)
+_point_finder = lru_cache(maxsize=2)(PointFinder)

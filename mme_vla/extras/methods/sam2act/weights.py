@@ -91,27 +91,21 @@ IMAGE_PREFIX = "sam2."
 """SAM2's tensors begin so; a checkpoint holds them twice more, once below each branch."""
 
 
-def released_name(target: str, mask_stages: int) -> str:
-    """The released code's name of one of the network's tensors; masks are halved `mask_stages`
+def released_names(targets: Iterable[str], mask_stages: int) -> NameTable:
+    """The released code's name of each of the network's tensors; masks are halved `mask_stages`
     times.
     """
-    name = target
-    for pattern, replacement in [
-        (r"memory\.encoder\.mask\.out\.", _mask(3 * mask_stages)),
-        *_PLACES,
-    ]:
-        name, count = re.subn(f"^{pattern}", replacement, name, count=1)
-        if count:
-            break
-    for pattern, replacement in _PARTS:
-        name = re.sub(pattern, replacement, name)
-    return name
-
-
-def released_names(targets: Iterable[str], mask_stages: int) -> NameTable:
+    places = [(r"memory\.encoder\.mask\.out\.", _mask(3 * mask_stages)), *_PLACES]
     table: NameTable = {}
     for name in targets:
-        released = released_name(name, mask_stages)
+        # The first place that fits, then the names of its parts
+        released = name
+        for pattern, replacement in places:
+            released, count = re.subn(f"^{pattern}", replacement, released, count=1)
+            if count:
+                break
+        for pattern, replacement in _PARTS:
+            released = re.sub(pattern, replacement, released)
         table[name] = [Piece(released, _AGES if name.endswith("memory.ages") else "")]
     return table
 

@@ -31,19 +31,42 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
 
     backbone: a file of `configs/backbone`; by default the one that is the model's full size.
     """
-    _check_attention_is_counted()
+    # Not every PyTorch counts attention.
+    q, k = torch.empty(1, 8, 20, 32, device="meta"), torch.empty(1, 8, 50, 32, device="meta")
+    mask = torch.zeros(1, 1, 20, 50, device="meta")
+    attention = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
+    if attention != 2 * (2 * 8 * 20 * 50 * 32):
+        raise UserError(
+            f"This PyTorch ({torch.__version__}) counts {attention} FLOPs for an attention of"
+            " 1,024,000."
+        )
+
     policy = on_meta(model, budget, backbone)
     assert isinstance(policy, NetworkPolicy)
     batch, memory = policy.full_batch("meta"), policy.memory
+    of_memory = 0
+    streamed = None
+    frames = 0
+    if memory is not None:
+        of_memory = flops(lambda: memory(batch.history))
+        # The frames between two chunks are encoded.
+        stored = memory.storage.stored_frames(2 * REPLAN)
+        frames = int((stored >= REPLAN).sum()) * flops(policy.warm_up_vision)
+    if isinstance(memory, RecurrentMemory):
+        # A stream reads its last frame alone.
+        history: Any = batch.history
+        last = slice(-(memory.storage.grid**2), None)
+        frame = history.features[:, last], history.positions[:, last], history.mask[:, last]
+        streamed = flops(lambda: memory.read(memory.update(memory.init_state(1), *frame)))
     return ModelCost(
         model=model,
         prompt=PolicySections.of(policy.config).processor.get("prompt_length", 0),
         parameters=sum(p.numel() for p in policy.parameters()),
         forward=flops(lambda: policy(batch)),
         chunk=flops(lambda: policy.sample_actions(batch)),
-        memory=0 if memory is None else flops(lambda: memory(batch.history)),
-        streamed=_streamed(policy, batch),
-        frames=_frames(policy),
+        memory=of_memory,
+        streamed=streamed,
+        frames=frames,
     )
 
 
@@ -64,32 +87,3 @@ def on_meta(model: str, budget: int | None = None, backbone: str | None = None) 
     if policy.memory is None:
         raise UserError(f"{model} has no memory, so no budget of {counted(budget, 'token')}.")
     return build_policy(model, backbone=backbone, device="meta", memory={"budget": budget})
-
-
-def _check_attention_is_counted() -> None:
-    q, k = torch.empty(1, 8, 20, 32, device="meta"), torch.empty(1, 8, 50, 32, device="meta")
-    mask = torch.zeros(1, 1, 20, 50, device="meta")
-    counted = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
-    if counted != 2 * (2 * 8 * 20 * 50 * 32):
-        raise UserError(
-            f"This PyTorch ({torch.__version__}) counts {counted} FLOPs for an attention of"
-            " 1,024,000."
-        )
-
-
-def _streamed(policy: Policy, batch: Any) -> int | None:
-    memory = policy.memory
-    if not isinstance(memory, RecurrentMemory):
-        return None
-    history = batch.history
-    last = slice(-(memory.storage.grid**2), None)
-    frame: Any = history.features[:, last], history.positions[:, last], history.mask[:, last]
-    return flops(lambda: memory.read(memory.update(memory.init_state(1), *frame)))
-
-
-def _frames(policy: Policy) -> int:
-    if policy.memory is None or not isinstance(policy, NetworkPolicy):
-        return 0
-    stored = policy.memory.storage.stored_frames(2 * REPLAN)
-    n_encoded = int((stored >= REPLAN).sum())
-    return n_encoded * flops(policy.warm_up_vision)

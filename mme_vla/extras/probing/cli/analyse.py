@@ -59,11 +59,13 @@ def attention(args: argparse.Namespace) -> None:
 
     policy, source, name = _subject(args)
     watch = AttentionWatch(policy)
-
-    def laps() -> dict[str, float]:
-        return {f"attention/{part}": mean for part, mean, _ in watch.lap().table()}
-
-    chunks = _watch(args, watch, laps, policy, source)
+    chunks = _watch(
+        args,
+        watch,
+        lambda: {f"attention/{part}": mean for part, mean, _ in watch.lap().table()},
+        policy,
+        source,
+    )
     mass = watch.result()
     known = _paper("attention_allocation", name)
     rows = []
