@@ -80,29 +80,9 @@ def check_integrated(
             " the memoryless policy."
         )
     check_past(config, memory, supports)
-    check_positions(config, integration, memory, supports)
-
-
-def check_past(config: Mapping[str, Any], memory: MemoryModule, supports: Set[str]) -> None:
-    """Make sure that the backbone reads past views if the memory gives them."""
-    sections = PolicySections.of(config)
-    if memory.past_view_spec is not None and "past" not in supports:
-        raise UserError(
-            f"The memory {sections.memory['name']!r} gives the vision tower past views along with"
-            f" the current ones, and the tower of the backbone {sections.backbone['name']!r} sees"
-            " one image at a time. Take another memory, a backbone that hosts `past` (pi05), or"
-            " past states alone (memory.views=false)."
-        )
-
-
-def check_positions(
-    config: Mapping[str, Any], integration: Integration, memory: MemoryModule, supports: Set[str]
-) -> None:
-    """Make sure that positions in time are possible: the tokens have a time, and the backbone takes
-    positions.
-    """
     if integration.memory_position != "time":
         return
+    # The tokens have a time, and the backbone takes positions.
     sections = PolicySections.of(config)
     if not memory.timed:
         raise UserError(
@@ -115,6 +95,18 @@ def check_positions(
             f"integration.memory_position=time: the backbone {sections.backbone['name']!r} has no"
             " place for blocks at positions of their own. Take memory_position=slot, or"
             " integration=modulator where it hosts that."
+        )
+
+
+def check_past(config: Mapping[str, Any], memory: MemoryModule, supports: Set[str]) -> None:
+    """Make sure that the backbone reads past views if the memory gives them."""
+    sections = PolicySections.of(config)
+    if memory.past_view_spec is not None and "past" not in supports:
+        raise UserError(
+            f"The memory {sections.memory['name']!r} gives the vision tower past views along with"
+            f" the current ones, and the tower of the backbone {sections.backbone['name']!r} sees"
+            " one image at a time. Take another memory, a backbone that hosts `past` (pi05), or"
+            " past states alone (memory.views=false)."
         )
 
 

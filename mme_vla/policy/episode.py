@@ -249,7 +249,7 @@ class Episode:
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
         history = self.required_history()
-        return self._memory.gather_selection(history, len(history) - 1)
+        return self._policy.require_memory().gather_selection(history, len(history) - 1)
 
     def required_history(self) -> OnlineHistory:
         """The history, once it has a frame.
@@ -331,7 +331,21 @@ class Episode:
             UserError: actions of another form, more than a chunk, or a delay beyond them.
         """
         space = self._robot.action
-        self.action_prefix = checked_prefix(actions, delay, space.horizon, space.width)
+        values = finite_array(actions, "the actions of the prefix")
+        require(
+            values.ndim == 2
+            and values.shape[1] == space.width
+            and 1 <= len(values) <= space.horizon,
+            f"set_action_prefix() needs 1 to {space.horizon} actions of {space.width} numbers, got"
+            f" shape {values.shape}.",
+        )
+        is_count = isinstance(delay, int) and not isinstance(delay, bool)
+        require(
+            is_count and 0 <= delay <= len(values),
+            f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)},"
+            " the actions given.",
+        )
+        self.action_prefix = ActionPrefix(values, delay)
 
     def restart_clock(self) -> None:
         """Count the current frame as 0 again; what is remembered keeps its times.
@@ -380,10 +394,6 @@ class Episode:
         """
         return self._policy.sampling_noise(self._generator)
 
-    @property
-    def _memory(self) -> "MemoryModule":
-        return self._policy.require_memory()
-
     def _state_stats(self) -> QuantileStats | None:
         """Statistics of the state, once the processor has any."""
         stats = self._policy.require_processor().stats
@@ -404,7 +414,7 @@ class Episode:
         self, count: int, demo: np.ndarray, actions: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Flags [count] of the next frames and the actions that led to the execution frames among
-        them.
+        them, by default the next ones of the chunk.
         """
         demo = np.broadcast_to(demo, (count,))
         begins_again = (np.diff(demo.astype(int)) > 0).any()
@@ -413,28 +423,23 @@ class Episode:
                 "A conditioning-video frame came after the first execution frame; the video goes"
                 " first."
             )
-        return demo, self._executed_now(int((~demo).sum()), actions)
-
-    def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
-        """The actions that led to the last `count` frames; by default the next ones of
-        the chunk.
-        """
+        n_executed = int((~demo).sum())
         space = self._robot.action
         if actions is None:
             if self._chunk is None or space.frames is None:
-                return self._no_actions
-            return self._chunk[:count]
+                return demo, self._no_actions
+            return demo, self._chunk[:n_executed]
         values = finite_array(actions, "actions")
         if values.ndim:
             if space.frames is None:
-                count = len(values)
-            values = values[max(len(values) - count, 0) :]
-        if values.shape != (count, space.width):
+                n_executed = len(values)
+            values = values[max(len(values) - n_executed, 0) :]
+        if values.shape != (n_executed, space.width):
             raise UserError(
-                f"actions must be [{count}, {space.width}], one for each execution frame; got"
+                f"actions must be [{n_executed}, {space.width}], one for each execution frame; got"
                 f" {values.shape}."
             )
-        return values
+        return demo, values
 
     def _take(
         self,
@@ -465,7 +470,7 @@ class Episode:
         self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None
     ) -> list[Tensor]:
         """Rows of motion of the next frames, if the memory reads them."""
-        if not self._memory.uses_proprio:
+        if not self._policy.require_memory().uses_proprio:
             return []
         if states is None:
             raise UserError(
@@ -517,23 +522,6 @@ class Episode:
                 f" {array.shape}."
             )
         return array
-
-
-def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) -> ActionPrefix:
-    """A prefix of a chunk of `horizon` actions of `width` numbers."""
-    values = finite_array(actions, "the actions of the prefix")
-    require(
-        values.ndim == 2 and values.shape[1] == width and 1 <= len(values) <= horizon,
-        f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape"
-        f" {values.shape}.",
-    )
-    is_count = isinstance(delay, int) and not isinstance(delay, bool)
-    require(
-        is_count and 0 <= delay <= len(values),
-        f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the"
-        " actions given.",
-    )
-    return ActionPrefix(values, delay)
 
 
 def prefix_overlap(
