@@ -169,7 +169,24 @@ def build_from_config(
     """
     values = policy_config(config)
     sections = {key: values[key] for key in SECTIONS if key in values}
-    check_token_budget(PolicySections.of(sections))
+    named = PolicySections.of(sections)
+    limit = named.token_budget
+    if limit is not None:
+        # Memory and subgoal together stay within it.
+        memory = named.memory.get("budget", 0)
+        subgoal = named.processor.get("subgoal_length")
+        if not PROMPTS[named.processor.get("prompt", "plain")].reads_subgoal:
+            subgoal = 0
+        if subgoal is None:
+            raise UserError(
+                f"token_budget={limit} needs a limit of the subgoal too: set"
+                " processor.subgoal_length."
+            )
+        require(
+            memory + subgoal <= limit,
+            f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal}"
+            f" tokens, more than token_budget={limit}: lower one of them, or raise token_budget.",
+        )
     if seed is None:
         seed = values.get("seed", 42)
     is_on_meta = torch.device(device).type == "meta"
@@ -209,26 +226,6 @@ def with_embodiment(config: DictConfig) -> DictConfig:
     OmegaConf.set_struct(config, False)
     config.embodiment = Embodiment.from_dict(section).to_dict()
     return config
-
-
-def check_token_budget(sections: PolicySections) -> None:
-    """Make sure that memory and subgoal together stay within `token_budget`, where there is one."""
-    budget = sections.token_budget
-    if budget is None:
-        return
-    memory = sections.memory.get("budget", 0)
-    subgoal = sections.processor.get("subgoal_length")
-    if not PROMPTS[sections.processor.get("prompt", "plain")].reads_subgoal:
-        subgoal = 0
-    if subgoal is None:
-        raise UserError(
-            f"token_budget={budget} needs a limit of the subgoal too: set processor.subgoal_length."
-        )
-    require(
-        memory + subgoal <= budget,
-        f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal}"
-        f" tokens, more than token_budget={budget}: lower one of them, or raise token_budget.",
-    )
 
 
 def build_processor(config: Mapping[str, Any]) -> PolicyProcessor:

@@ -174,7 +174,7 @@ class Episode:
         self._take(views[self._robot.memory_camera], demo, executed, states)
         if self._past is not None:
             self._past.take(views)
-        self._set_window(new_frames)
+        self._recent = [*self._recent, *new_frames][-samples.window :]
 
     def add_frames(
         self,
@@ -244,7 +244,8 @@ class Episode:
         processor = self._policy.require_processor()
         check_reach(state, self._state_stats(), "the state")
         images = processor.images([views[name] for name in names])
-        self._set_window([(images, torch.from_numpy(state.copy()))])
+        newest = (images, torch.from_numpy(state.copy()))
+        self._recent = [*self._recent, newest][-processor.samples.window :]
 
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -451,13 +452,27 @@ class Episode:
         """Append checked frames of the memory camera to the history, and the actions that led to
         them.
         """
+        processor = self._policy.require_processor()
         if self.history is not None:
-            motion = self._motion(demo, executed, states)
+            motion: list[Tensor] = []
+            if self._policy.require_memory().uses_proprio:
+                if states is None:
+                    raise UserError(
+                        "This policy's memory reads the robot's own states and actions: give past"
+                        " frames with their states (`Episode.observe`), not as images alone."
+                    )
+                actions = np.zeros((len(demo), self._robot.action.width), np.float32)
+                known = np.zeros(len(demo), bool)
+                if self._robot.action.frames is not None:
+                    rows = np.flatnonzero(~demo)[: len(executed)]
+                    actions[rows] = executed[: len(rows)]
+                    known[rows] = True
+                motion += motion_rows(processor, states, actions, known)
             self.history.take(frames, self._policy.encode_frames)
             self._motion_of_frames += motion
             if not self._video_over:
                 self.history.exec_start = self.n_observed_frames + int(demo.sum())
-        longest = self._policy.require_processor().prompt_spec.past_actions
+        longest = processor.prompt_spec.past_actions
         past = np.concatenate([self._executed, executed])
         self._executed = past[max(len(past) - longest, 0) :]
         if self._chunk is not None:
@@ -466,25 +481,6 @@ class Episode:
             self._video_over = True
         self.n_observed_frames += len(demo)
 
-    def _motion(
-        self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None
-    ) -> list[Tensor]:
-        """Rows of motion of the next frames, if the memory reads them."""
-        if not self._policy.require_memory().uses_proprio:
-            return []
-        if states is None:
-            raise UserError(
-                "This policy's memory reads the robot's own states and actions: give past frames"
-                " with their states (`Episode.observe`), not as images alone."
-            )
-        actions = np.zeros((len(demo), self._robot.action.width), np.float32)
-        known = np.zeros(len(demo), bool)
-        if self._robot.action.frames is not None:
-            rows = np.flatnonzero(~demo)[: len(executed)]
-            actions[rows] = executed[: len(rows)]
-            known[rows] = True
-        return list(motion_rows(self._policy.require_processor(), states, actions, known))
-
     def _prepared_images(self, views: Mapping[str, FrameBatch], frame: int) -> Tensor | None:
         """The views of a frame as the network takes them; None unless all cameras rendered it."""
         images = [view.image(frame) for view in views.values()]
@@ -492,9 +488,6 @@ class Episode:
         if len(rendered) < len(images):
             return None
         return self._policy.require_processor().images(rendered)
-
-    def _set_window(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:
-        self._recent = [*self._recent, *frames][-self._policy.require_processor().samples.window :]
 
     def _require_rendered(self, images: Tensor | None) -> Tensor:
         if images is None:

@@ -3,7 +3,7 @@ same with that peg.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from copy import deepcopy
 from functools import partial
@@ -123,18 +123,16 @@ class InsertPeg(Task):
     def _draw_pegs(self, draws: Draws, box: Point) -> list[tuple[Point, float]]:
         pegs: list[tuple[Point, float]] = []
         for _ in self.pegs:
-            place = self._draw_place(draws, box, [other for other, _ in pegs])
+            for _ in range(TRIES):
+                place = (-0.2 + 0.4 * draws.uniform(), -0.3 + 0.6 * draws.uniform())
+                clear = all(math.dist(place, other) > FROM_PEG for other, _ in pegs)
+                if clear and math.dist(place, box) > FROM_BOX:
+                    break
+            else:
+                raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
             pegs.append((place, math.radians(-45 + 90 * draws.uniform())))
         self.values.note("initializations.pegs", pegs)
         return pegs
-
-    def _draw_place(self, draws: Draws, box: Point, others: Sequence[Point]) -> Point:
-        for _ in range(TRIES):
-            place = (-0.2 + 0.4 * draws.uniform(), -0.3 + 0.6 * draws.uniform())
-            clear = all(math.dist(place, other) > FROM_PEG for other in others)
-            if clear and math.dist(place, box) > FROM_BOX:
-                return place
-        raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
 
     def flip_fact(self) -> dict[str, Any] | None:
         """The first two pegs, of which the video takes one, change places."""

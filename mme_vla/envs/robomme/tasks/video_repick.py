@@ -80,7 +80,17 @@ class VideoRepick(Task):
                     self._add_cube(draws, SAMPLED_COLOURS[i], TABLE)
             target = draws.integer(0, len(self.cubes))
         else:
-            target, initiators = self._draw_equal_cubes(draws)
+            # Three cubes of one colour; the target and others begin swaps.
+            equal = SAMPLED_COLOURS[draws.integer(0, 3)]
+            draws.permutation(4)  # part of the official stream, without effect
+            for anchor in rotated_anchors(draws, 3):
+                self._add_cube(draws, equal, Region(anchor, ANCHOR_HALF))
+            target = draws.permutation(3)[0]
+            initiators = [target]
+            others = [i for i in range(len(self.cubes)) if i != target]
+            for i in draws.permutation(2):
+                initiators.append(others[i])
+            initiators = initiators[: self.swap_count]
         count = len(self.cubes)
         self.cube = self.cubes[values.integer("objects.target", lambda: target, most=count - 1)]
         self.wrong_cubes = [cube for cube in self.cubes if cube is not self.cube]
@@ -111,19 +121,6 @@ class VideoRepick(Task):
             else:
                 colour = values.word(f"objects.colors.{i}", str, COLOURS)
             self._add_cube(draws, colour, TABLE)
-
-    def _draw_equal_cubes(self, draws: Draws) -> tuple[int, list[int]]:
-        """Add three cubes of one colour; indices of the target and of those that begin a swap."""
-        colour = SAMPLED_COLOURS[draws.integer(0, 3)]
-        draws.permutation(4)  # part of the official stream, without effect
-        for anchor in rotated_anchors(draws, 3):
-            self._add_cube(draws, colour, Region(anchor, ANCHOR_HALF))
-        target = draws.permutation(3)[0]
-        initiators = [target]
-        others = [i for i in range(len(self.cubes)) if i != target]
-        for i in draws.permutation(2):
-            initiators.append(others[i])
-        return target, initiators[: self.swap_count]
 
     def _add_cube(self, draws: Draws, colour: str | RGB, region: Region) -> None:
         i, avoid = len(self.cubes), [self.button, *self.cubes]
