@@ -531,7 +531,7 @@ class EpisodeEnv:
                 frame[name] = self.render_image(value)
             else:
                 frame[name] = None
-        # Without the names of the first frame, images would be of other frames than states.
+        # Every frame has the names of the first, or images would be of other frames than states.
         if self._frames == 0:
             require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
             self._names = set(frame)
