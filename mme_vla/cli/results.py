@@ -184,7 +184,12 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
     recorded = Protocol.of_records(of_split or records, full)
     tasks = recorded.tasks
     if args.tasks is not None:
-        tasks = _tasks(args.tasks)
+        names: list[str] = []
+        for word in args.tasks:  # as `tasks=` takes them
+            names += [name.strip() for name in word.strip("[]").split(",") if name.strip()]
+        tasks = tuple(names)
+        if names == [ALL]:
+            tasks = PAPER_ORDER
     elif args.all:
         tasks = tasks_of(records)
     if args.episodes is not None:
@@ -205,16 +210,6 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
         samples=args.samples,
         seed=args.seed,
     )
-
-
-def _tasks(words: Sequence[str]) -> tuple[str, ...]:
-    """The names of `--tasks`, as `tasks=` takes them."""
-    names: list[str] = []
-    for word in words:
-        names += [name.strip() for name in word.strip("[]").split(",") if name.strip()]
-    if names == [ALL]:
-        return PAPER_ORDER
-    return tuple(names)
 
 
 def _check_views(args: argparse.Namespace) -> None:

@@ -237,19 +237,15 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
     episodes = np.searchsorted(starts, first, side="right") - 1
     for row, episode in zip(first.tolist(), episodes.tolist(), strict=True):
         text = texts[numbers[row]]
-        known = {_plain(listed_text) for listed_text in listed_tasks[episode]}
-        if known and _plain(text) not in known:
+        # Spaces around a task and its capitals do not count.
+        known = {listed_text.strip().casefold() for listed_text in listed_tasks[episode]}
+        if known and text.strip().casefold() not in known:
             raise UserError(
                 f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, {brief(text)} in"
                 f" {TASKS}; meta/episodes lists for this episode"
                 f" {brief(list(listed_tasks[episode]), 200)}. {CORRECT}"
             )
     return FrameTasks(first, _goals(root, [texts[number] for number in numbers[first]]))
-
-
-def _plain(text: str) -> str:
-    """A text as tasks are compared: spaces around it and capitals do not count."""
-    return text.strip().casefold()
 
 
 def _goals(root: Path, texts: Sequence[str]) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partialmethod
+from functools import partial, partialmethod
 
 
 @contextmanager
@@ -97,10 +97,7 @@ def progress(
     with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task(description, total=total, completed=done)
 
-        def advance(steps: int) -> None:
-            bar.advance(task, steps)
-
-        yield advance
+        yield partial(bar.advance, task)
 
 
 def _duration_text(seconds: float) -> str:

@@ -97,7 +97,15 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
         target = Features({name: _kind(features[name]) for name in columns})
     large = any(features[name].dtype == "image" for name in columns)
     files = parquet_files(root, "data")
-    folder = user_cache("tables") / _tables_key(root, files, large)
+    # A digest of all content, or, where images make it large, of its fingerprint and the times of
+    # change (ctime), which the system sets whenever content is written; no program can keep them.
+    digest = sha256()
+    if large:
+        digest.update(content_fingerprint(root, ("data",)).encode())
+    for file in files:
+        content = str(file.stat().st_ctime_ns) if large else file_sum(file)
+        digest.update(f"{file.relative_to(root).as_posix()} {content}\n".encode())
+    folder = user_cache("tables") / digest.hexdigest()[:16]
     if large and not folder.exists() and sys.stderr.isatty():
         print(f"{root}: copying the images once to {folder} …", file=sys.stderr, flush=True)
     with decoding(root / "data", "tables of frames", REMEDY), SuppressProgressBars():
@@ -108,22 +116,6 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
             cache_dir=str(folder),
         )
     return table.with_format("arrow")
-
-
-def _tables_key(root: Path, files: Sequence[Path], large: bool) -> str:
-    """Names the content of tables: all of it, or, where images make them large, the fingerprint and
-    times of change.
-
-    The time of change (ctime) is set by the system whenever content is written; no program can keep
-    it.
-    """
-    digest = sha256()
-    if large:
-        digest.update(content_fingerprint(root, ("data",)).encode())
-    for file in files:
-        content = str(file.stat().st_ctime_ns) if large else file_sum(file)
-        digest.update(f"{file.relative_to(root).as_posix()} {content}\n".encode())
-    return digest.hexdigest()[:16]
 
 
 def flat(column: Any) -> Any:

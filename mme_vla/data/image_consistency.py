@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.episode_table import Description, VideoSpans
+from mme_vla.data.episode_table import Description
 from mme_vla.data.lerobot_files import REMEDY
 from mme_vla.data.video import video_file
 from mme_vla.errors import UserError, brief, require
@@ -130,8 +130,18 @@ def check_videos(dataset: Description, column: str) -> None:
     """Compare the spans of episodes in video files with each other, with their lengths, and with
     the files.
     """
+    meta = f"{dataset.root}/meta/episodes"
     spans = dataset.episodes.videos[column]
-    _check_ends(dataset, column, spans)
+    if spans.end is not None:
+        frames = (spans.end - spans.begin) * dataset.fps
+        episode = first_wrong(~(np.abs(frames - dataset.lengths) <= HALF))
+        if episode is not None:
+            raise UserError(
+                f"{meta}: the pictures of {column} of episode {episode} lie between"
+                f" {spans.begin[episode]:.4f} s and {spans.end[episode]:.4f} s,"
+                f" {frames[episode]:.2f} frames at fps={dataset.fps:g}, but the episode has"
+                f" {dataset.lengths[episode]} frames. {CORRECT}"
+            )
     # Which episodes each file holds, in the order of their images.
     episodes_of: dict[Path, np.ndarray] = {}
     places = np.stack([spans.chunk, spans.file], axis=1)
@@ -140,8 +150,18 @@ def check_videos(dataset: Description, column: str) -> None:
         path = video_file(dataset.root, dataset.info.video_path, column, chunk, file)
         episodes = np.flatnonzero(file_of_episode.reshape(-1) == number)
         episodes_of[path] = episodes[np.argsort(spans.begin[episodes], kind="stable")]
+    # No two episodes have the same pictures of a file.
     for path, episodes in episodes_of.items():
-        _check_neighbours(dataset, column, path, episodes, spans.begin[episodes])
+        begins = spans.begin[episodes]
+        ends = begins + dataset.lengths[episodes] / dataset.fps
+        k = first_wrong((ends[:-1] - begins[1:]) * dataset.fps > HALF)
+        if k is not None:
+            raise UserError(
+                f"{meta}: episodes {episodes[k]} and {episodes[k + 1]} overlap in the video"
+                f" {path.name} of {column}: one ends at {ends[k]:.4f} s, and the other begins at"
+                f" {begins[k + 1]:.4f} s (from_timestamp). One of them would show the other's"
+                f" pictures. {CORRECT}"
+            )
     with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
         headers = list(pool.map(_read_header, episodes_of))
     sizes = set()
@@ -154,36 +174,6 @@ def check_videos(dataset: Description, column: str) -> None:
             _check_frames_of_video(dataset, column, path, episodes, begins)
     for width, height in sizes:
         _compare_size(dataset, column, width, height)
-
-
-def _check_ends(dataset: Description, column: str, videos: VideoSpans) -> None:
-    if videos.end is None:
-        return
-    begins, ends = videos.begin, videos.end
-    spans = (ends - begins) * dataset.fps
-    episode = first_wrong(~(np.abs(spans - dataset.lengths) <= HALF))
-    if episode is not None:
-        raise UserError(
-            f"{dataset.root}/meta/episodes: the pictures of {column} of episode {episode} lie"
-            f" between {begins[episode]:.4f} s and {ends[episode]:.4f} s, {spans[episode]:.2f}"
-            f" frames at fps={dataset.fps:g}, but the episode has {dataset.lengths[episode]}"
-            f" frames. {CORRECT}"
-        )
-
-
-def _check_neighbours(
-    dataset: Description, column: str, path: Path, inside: np.ndarray, begins: np.ndarray
-) -> None:
-    """Make sure that no two episodes have the same pictures of a file."""
-    ends = begins + dataset.lengths[inside] / dataset.fps
-    k = first_wrong((ends[:-1] - begins[1:]) * dataset.fps > HALF)
-    if k is not None:
-        raise UserError(
-            f"{dataset.root}/meta/episodes: episodes {inside[k]} and {inside[k + 1]} overlap in the"
-            f" video {path.name} of {column}: one ends at {ends[k]:.4f} s, and the other begins at"
-            f" {begins[k + 1]:.4f} s (from_timestamp). One of them would show the other's pictures."
-            f" {CORRECT}"
-        )
 
 
 def _read_header(path: Path) -> _Header:
@@ -232,7 +222,14 @@ def _check_frames_of_video(
     """Compare the time of every picture in a file with the times at which rows look for theirs.
     Decodes nothing.
     """
-    times = _frame_times(path)
+    import av
+
+    with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        ticks = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
+        if not ticks:
+            raise ValueError("it holds no picture")
+        times = np.sort(np.array(ticks, np.int64)) * float(stream.time_base or 0)
     lengths, fps = dataset.lengths[inside], dataset.fps
     exact = len(times) == lengths.sum()
     before = 0
@@ -260,18 +257,3 @@ def _check_frames_of_video(
                 f" nearest at {times[nearest[frame]]:.4f} s: it is shorter than the table beside"
                 f" it, shifted, or of another rate. {CORRECT}"
             )
-
-
-def _frame_times(path: Path) -> np.ndarray:
-    """When each picture of a file is displayed, seconds, ascending [n]; reads the file without
-    decoding it.
-    """
-    import av
-
-    with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        ticks = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
-        if not ticks:
-            raise ValueError("it holds no picture")
-        seconds = np.sort(np.array(ticks, np.int64)) * float(stream.time_base or 0)
-    return seconds

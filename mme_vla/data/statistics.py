@@ -62,7 +62,13 @@ def compute_norm_stats(
         narrow: what to do about a number whose range the values leave by far (`check_ranges`).
     """
     check_choice("narrow", narrow, NARROW)
-    steps = _counted_steps(sources, episodes, video)
+    # All (source, episode, step) that count [n, 3].
+    parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
+    for i, source in enumerate(sources):
+        for episode in range(len(source)) if episodes is None else episodes[i]:
+            own = _steps_of(source, int(episode), video).astype(np.int32)
+            parts.append(np.stack([np.full_like(own, i), np.full_like(own, episode), own], axis=1))
+    steps = np.concatenate(parts)
     require(
         len(steps) >= 2,
         f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.",
@@ -215,20 +221,6 @@ def _steps_of(source: EpisodeSource, episode: int, video: bool) -> np.ndarray:
     if video:
         return np.arange(int(source.lengths[episode]))
     return np.asarray(source.decisions(episode), np.int64)
-
-
-def _counted_steps(
-    sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool
-) -> np.ndarray:
-    """All (source, episode, step) of the execution phases, or of whole records, int32 [n, 3]."""
-    parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
-    for i, source in enumerate(sources):
-        for episode in range(len(source)) if episodes is None else episodes[i]:
-            step = _steps_of(source, int(episode), video).astype(np.int32)
-            parts.append(
-                np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1)
-            )
-    return np.concatenate(parts)
 
 
 def normalised_states(states: np.ndarray) -> Tensor:

@@ -531,7 +531,16 @@ class EpisodeEnv:
                 frame[name] = self.render_image(value)
             else:
                 frame[name] = None
-        self._check_frame(frame)
+        # Every frame has the names of the first, or images would be of other frames than states.
+        if self._frames == 0:
+            require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
+            self._names = set(frame)
+        place = f"{self.spec.task}: frame {self._frames} of the episode"
+        remedy = "Give the same cameras and the state in every observation."
+        missing = sorted(self._names - set(frame))
+        require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
+        added = sorted(set(frame) - self._names)
+        require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
         self._frames += 1
         return frame
 
@@ -549,20 +558,6 @@ class EpisodeEnv:
             first_camera = next(images for name, images in lists.items() if name != "state_list")
             lists.setdefault("front_rgb_list", first_camera)  # what `play` shows
         return lists
-
-    def _check_frame(self, frame: Mapping[str, Any]) -> None:
-        """Every frame of an episode has the names of the first, or images would be of other frames
-        than states.
-        """
-        if self._frames == 0:
-            require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
-            self._names = set(frame)
-        place = f"{self.spec.task}: frame {self._frames} of the episode"
-        remedy = "Give the same cameras and the state in every observation."
-        missing = sorted(self._names - set(frame))
-        require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
-        added = sorted(set(frame) - self._names)
-        require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
 
     def _info(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> dict[str, Any]:
         report: dict[str, Any] = {

@@ -39,7 +39,7 @@ from mme_vla.errors import UserError, check_known, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
-    from mme_vla.envs.subtasks import Choice, SubTask
+    from mme_vla.envs.subtasks import SubTask
     from mme_vla.envs.task import Task
 
 log = logging.getLogger(__name__)
@@ -483,19 +483,16 @@ class RoboMMEEnv(gymnasium.Env):
         for choice in self.task.choices():
             option = choice.option.to_dict()
             if self.include.possible:
-                option["possible"] = self._is_possible(choice)
+                # An object that it fits is within the arm's reach.
+                base = self.task.agent.robot.pose.sp.p
+                option["possible"] = choice.candidates is None or any(
+                    np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates
+                )
             options.append(option)
         if self.include.possible and not any(option["possible"] for option in options):
             for option in options:  # something has to be chosen
                 option["possible"] = True
         return options
-
-    def _is_possible(self, choice: "Choice") -> bool:
-        """Whether an object that an option fits is within the arm's reach."""
-        if choice.candidates is None:
-            return True
-        base = self.task.agent.robot.pose.sp.p
-        return any(np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates)
 
     def _timed_out(self, run: _Run) -> bool:
         return run.count >= self.max_steps + run.hold_steps + _MARGIN

@@ -233,21 +233,16 @@ def formula(task: str, split: str, episode: int) -> tuple[int, str]:
         number = TASK_NAMES.index(task) + 1
     place = episode
     if split in FURTHER_SPLITS:
-        place = _further_place(split, episode)
+        first = SPLITS["test"]
+        place = first + episode
+        level = split.removeprefix(FURTHER).removeprefix("_")
+        if level:
+            # The places of this difficulty in the first cycle beyond the test split
+            cycle = range(first, first + len(_CYCLE))
+            places = [other for other in cycle if _CYCLE[other % len(_CYCLE)] == level]
+            n_cycles, index = divmod(episode, len(places))
+            place = places[index] + n_cycles * len(_CYCLE)
     return offset + stride * number + 100 * place, _CYCLE[place % 4]
-
-
-def _further_place(split: str, episode: int) -> int:
-    """Index, in the rule of seeds and difficulties, of an episode beyond the test split."""
-    first = SPLITS["test"]
-    level = split.removeprefix(FURTHER).removeprefix("_")
-    if not level:
-        return first + episode
-    # The places of this difficulty in the first cycle beyond the test split
-    cycle = range(first, first + len(_CYCLE))
-    places = [place for place in cycle if _CYCLE[place % len(_CYCLE)] == level]
-    n_cycles, index = divmod(episode, len(places))
-    return places[index] + n_cycles * len(_CYCLE)
 
 
 def check_task_name(task: str) -> None:

@@ -8,8 +8,8 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -205,32 +205,36 @@ MARGIN = 1e-3
 """Metres that a box must lie beyond the edge of an image."""
 
 
-def links_culled(env: "BaseEnv", camera: "RenderCamera") -> AbstractContextManager[None]:
-    """While a camera renders on the CPU, hide the links of the robot that it cannot see."""
+@contextmanager
+def links_culled(env: "BaseEnv", camera: "RenderCamera") -> Iterator[None]:
+    """While a camera renders on the CPU, hide the links of the robot that it cannot see; the image
+    stays the same.
+
+    A software renderer spends a millisecond on each link of the robot whose triangles all lie
+    outside the image.
+    """
     from sapien.render import RenderBodyComponent
 
     if not env._render_device.is_cpu():
-        return nullcontext()
+        yield
+        return
     bodies = []
     for link in env.agent.robot.links:
         body = link._objs[0].entity.find_component_by_type(RenderBodyComponent)
         if body is not None:
             bodies.append(body)
-    return culled(bodies, camera._render_cameras[0])
-
-
-@contextmanager
-def culled(
-    bodies: Sequence["sapien.render.RenderBodyComponent"],
-    camera: "sapien.render.RenderCameraComponent",
-) -> Iterator[None]:
-    """Hide the bodies that a camera cannot see while it renders; the image stays the same.
-
-    A software renderer spends a millisecond on each link of the robot whose triangles all lie
-    outside the image.
-    """
     boxes = np.array([body.get_global_aabb_fast() for body in bodies]).reshape(-1, 2, 3)
-    beyond = _beyond(camera, boxes)
+    corners = np.stack([boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1)
+
+    # Which boxes lie beyond one edge of the image [n].
+    seen_by = camera._render_cameras[0]
+    view = seen_by.global_pose.inv().to_transformation_matrix()
+    # each [n, 8]
+    x, y, z = np.moveaxis(corners @ view[:3, :3].T + view[:3, 3], -1, 0)  # forward, left, up
+    right, top = x * np.tan(seen_by.fovx / 2), x * np.tan(seen_by.fovy / 2)
+    outside = np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN  # [4, n, 8]
+    beyond = np.any(np.all(outside, axis=-1), axis=0)
+
     hidden = [(body, body.visibility) for body, flag in zip(bodies, beyond, strict=True) if flag]
     try:
         for body, _ in hidden:
@@ -239,16 +243,3 @@ def culled(
     finally:
         for body, visibility in hidden:
             body.visibility = visibility
-
-
-def _beyond(camera: "sapien.render.RenderCameraComponent", boxes: np.ndarray) -> np.ndarray:
-    """Which boxes lie beyond one edge of the camera's image, [n]; boxes: lowest and highest corner,
-    [n, 2, 3].
-    """
-    view = camera.global_pose.inv().to_transformation_matrix()
-    corners = np.stack([boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1)
-    # each [n, 8]
-    x, y, z = np.moveaxis(corners @ view[:3, :3].T + view[:3, 3], -1, 0)  # forward, left, up
-    right, top = x * np.tan(camera.fovx / 2), x * np.tan(camera.fovy / 2)
-    outside = np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN  # [4, n, 8]
-    return np.any(np.all(outside, axis=-1), axis=0)

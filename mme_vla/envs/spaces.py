@@ -29,7 +29,6 @@ from mme_vla.errors import UserError, check_known, did_you_mean, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-    from mme_vla.envs.robomme.scene.things import Thing
     from mme_vla.envs.task import Task
 
 
@@ -163,10 +162,11 @@ class MultiChoice(ActionSpace):
         )
         pixel = _numbers(point, 2, "a pixel's row and column")
 
-        def distance(thing: "Thing") -> float:
-            return float(np.linalg.norm(project(thing.position) - pixel))
-
-        choice.run(control.demonstrator, min(choice.candidates, key=distance))
+        nearest = min(
+            choice.candidates,
+            key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)),
+        )
+        choice.run(control.demonstrator, nearest)
 
 
 SPACES: dict[str, ActionSpace] = {

@@ -32,15 +32,6 @@ _FORMER_NAMES = {
 """What tasks of earlier versions define → what replaced it."""
 
 
-def key_pose(subtask: SubTask) -> VisibleFact:
-    """What the end of a sub-task shows: its text, and the objects that it is about."""
-    names = [thing.name for thing in subtask.targets]
-    value = subtask.text
-    if names:
-        value = f"{subtask.text}: {', '.join(names)}"
-    return VisibleFact(value, frozenset(names))
-
-
 def candidates_among(things: Sequence[Thing], correct: Sequence[Thing]) -> Candidates:
     """Things as candidates, those that are also in `correct` as the correct ones."""
     numbers = set(map(id, correct))
@@ -207,10 +198,16 @@ class Task(Stage):
             counts = self.fact_choices is None or subtask.choice in self.fact_choices
             if not subtask.choice or subtask.video != has_video or not counts:
                 continue
-            if has_video:
-                facts[f"{i} {subtask.text}"] = key_pose(subtask)
-            else:
-                facts[f"{i} {subtask.text}"] = self.count_fact(i)
+            name = f"{i} {subtask.text}"
+            if not has_video:
+                facts[name] = self.count_fact(i)
+                continue
+            # What its end shows: its text, and the objects that it is about.
+            things = [thing.name for thing in subtask.targets]
+            value = subtask.text
+            if things:
+                value += f": {', '.join(things)}"
+            facts[name] = VisibleFact(value, frozenset(things))
         return facts
 
     def count_fact(self, i: int) -> VisibleFact:

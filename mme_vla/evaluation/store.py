@@ -88,10 +88,15 @@ def claim_run(
         _await_content(folder / RUN_FILE)
     there = read_run(folder)
     if there["fingerprint"] != content["fingerprint"]:
+        earlier, later = flat(there["settings"]), flat(settings)
+        changes = []
+        for key in sorted({*earlier, *later}):
+            old, new = earlier.get(key, "not set"), later.get(key, "not set")
+            if old != new:
+                changes.append(f"{key} was {brief(old)}, is {brief(new)}")
         raise UserError(
-            f"{folder} holds a run with other settings:"
-            f" {_differences(there['settings'], settings)}. Resume it with its own settings, or"
-            " choose another folder."
+            f"{folder} holds a run with other settings: {'; '.join(changes)}. Resume it with its"
+            " own settings, or choose another folder."
         )
     return there
 
@@ -154,16 +159,6 @@ def _await_content(path: Path, patience: float = 2) -> None:
     end = time.monotonic() + patience
     while path.stat().st_size == 0 and time.monotonic() < end:
         time.sleep(0.05)
-
-
-def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    earlier, later = flat(there), flat(now)
-    words = []
-    for key in sorted({*earlier, *later}):
-        old, new = earlier.get(key, "not set"), later.get(key, "not set")
-        if old != new:
-            words.append(f"{key} was {brief(old)}, is {brief(new)}")
-    return "; ".join(words)
 
 
 RECORDS = "episodes.jsonl"  # Name of a run's file; its shards are called `episodes-<shard>.jsonl`

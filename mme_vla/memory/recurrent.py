@@ -364,7 +364,13 @@ class RecurrentMemory(MemoryModule):
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
-            tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
+            # Means over the real frames of a batch.
+            count = valid.sum().clamp(min=1)
+            means = {}
+            for name in statistics[0]:
+                values = torch.cat([chunk[name] for chunk in statistics], 1)  # b t
+                means[name] = (values * valid).sum() / count
+            tokens.metrics = means | self.layer.summary(start, state)
         return tokens
 
     def _advance(
@@ -499,16 +505,6 @@ class RecurrentMemory(MemoryModule):
 
     def _by_frame(self, x: Tensor) -> Tensor:
         return x.unflatten(1, (-1, self.storage.grid**2))
-
-    @staticmethod
-    def _metrics(statistics: Sequence[Statistics], valid: Tensor) -> dict[str, Tensor]:
-        """Mean over the real frames of a batch."""
-        count = valid.sum().clamp(min=1)
-        metrics = {}
-        for name in statistics[0]:
-            numbers = torch.cat([chunk[name] for chunk in statistics], 1)  # b t
-            metrics[name] = (numbers * valid).sum() / count
-        return metrics
 
 
 def _stack(states: Sequence[State]) -> State:

@@ -80,29 +80,9 @@ def check_integrated(
             " the memoryless policy."
         )
     check_past(config, memory, supports)
-    check_positions(config, integration, memory, supports)
-
-
-def check_past(config: Mapping[str, Any], memory: MemoryModule, supports: Set[str]) -> None:
-    """Make sure that the backbone reads past views if the memory gives them."""
-    sections = PolicySections.of(config)
-    if memory.past_view_spec is not None and "past" not in supports:
-        raise UserError(
-            f"The memory {sections.memory['name']!r} gives the vision tower past views along with"
-            f" the current ones, and the tower of the backbone {sections.backbone['name']!r} sees"
-            " one image at a time. Take another memory, a backbone that hosts `past` (pi05), or"
-            " past states alone (memory.views=false)."
-        )
-
-
-def check_positions(
-    config: Mapping[str, Any], integration: Integration, memory: MemoryModule, supports: Set[str]
-) -> None:
-    """Make sure that positions in time are possible: the tokens have a time, and the backbone takes
-    positions.
-    """
     if integration.memory_position != "time":
         return
+    # The tokens have a time, and the backbone takes positions.
     sections = PolicySections.of(config)
     if not memory.timed:
         raise UserError(
@@ -115,6 +95,18 @@ def check_positions(
             f"integration.memory_position=time: the backbone {sections.backbone['name']!r} has no"
             " place for blocks at positions of their own. Take memory_position=slot, or"
             " integration=modulator where it hosts that."
+        )
+
+
+def check_past(config: Mapping[str, Any], memory: MemoryModule, supports: Set[str]) -> None:
+    """Make sure that the backbone reads past views if the memory gives them."""
+    sections = PolicySections.of(config)
+    if memory.past_view_spec is not None and "past" not in supports:
+        raise UserError(
+            f"The memory {sections.memory['name']!r} gives the vision tower past views along with"
+            f" the current ones, and the tower of the backbone {sections.backbone['name']!r} sees"
+            " one image at a time. Take another memory, a backbone that hosts `past` (pi05), or"
+            " past states alone (memory.views=false)."
         )
 
 
@@ -177,7 +169,24 @@ def build_from_config(
     """
     values = policy_config(config)
     sections = {key: values[key] for key in SECTIONS if key in values}
-    check_token_budget(PolicySections.of(sections))
+    named = PolicySections.of(sections)
+    limit = named.token_budget
+    if limit is not None:
+        # Memory and subgoal together stay within it.
+        memory = named.memory.get("budget", 0)
+        subgoal = named.processor.get("subgoal_length")
+        if not PROMPTS[named.processor.get("prompt", "plain")].reads_subgoal:
+            subgoal = 0
+        if subgoal is None:
+            raise UserError(
+                f"token_budget={limit} needs a limit of the subgoal too: set"
+                " processor.subgoal_length."
+            )
+        require(
+            memory + subgoal <= limit,
+            f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal}"
+            f" tokens, more than token_budget={limit}: lower one of them, or raise token_budget.",
+        )
     if seed is None:
         seed = values.get("seed", 42)
     is_on_meta = torch.device(device).type == "meta"
@@ -217,26 +226,6 @@ def with_embodiment(config: DictConfig) -> DictConfig:
     OmegaConf.set_struct(config, False)
     config.embodiment = Embodiment.from_dict(section).to_dict()
     return config
-
-
-def check_token_budget(sections: PolicySections) -> None:
-    """Make sure that memory and subgoal together stay within `token_budget`, where there is one."""
-    budget = sections.token_budget
-    if budget is None:
-        return
-    memory = sections.memory.get("budget", 0)
-    subgoal = sections.processor.get("subgoal_length")
-    if not PROMPTS[sections.processor.get("prompt", "plain")].reads_subgoal:
-        subgoal = 0
-    if subgoal is None:
-        raise UserError(
-            f"token_budget={budget} needs a limit of the subgoal too: set processor.subgoal_length."
-        )
-    require(
-        memory + subgoal <= budget,
-        f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal}"
-        f" tokens, more than token_budget={budget}: lower one of them, or raise token_budget.",
-    )
 
 
 def build_processor(config: Mapping[str, Any]) -> PolicyProcessor:

@@ -174,7 +174,7 @@ class Episode:
         self._take(views[self._robot.memory_camera], demo, executed, states)
         if self._past is not None:
             self._past.take(views)
-        self._set_window(new_frames)
+        self._recent = [*self._recent, *new_frames][-samples.window :]
 
     def add_frames(
         self,
@@ -244,12 +244,13 @@ class Episode:
         processor = self._policy.require_processor()
         check_reach(state, self._state_stats(), "the state")
         images = processor.images([views[name] for name in names])
-        self._set_window([(images, torch.from_numpy(state.copy()))])
+        newest = (images, torch.from_numpy(state.copy()))
+        self._recent = [*self._recent, newest][-processor.samples.window :]
 
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
         history = self.required_history()
-        return self._memory.gather_selection(history, len(history) - 1)
+        return self._policy.require_memory().gather_selection(history, len(history) - 1)
 
     def required_history(self) -> OnlineHistory:
         """The history, once it has a frame.
@@ -331,7 +332,21 @@ class Episode:
             UserError: actions of another form, more than a chunk, or a delay beyond them.
         """
         space = self._robot.action
-        self.action_prefix = checked_prefix(actions, delay, space.horizon, space.width)
+        values = finite_array(actions, "the actions of the prefix")
+        require(
+            values.ndim == 2
+            and values.shape[1] == space.width
+            and 1 <= len(values) <= space.horizon,
+            f"set_action_prefix() needs 1 to {space.horizon} actions of {space.width} numbers, got"
+            f" shape {values.shape}.",
+        )
+        is_count = isinstance(delay, int) and not isinstance(delay, bool)
+        require(
+            is_count and 0 <= delay <= len(values),
+            f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)},"
+            " the actions given.",
+        )
+        self.action_prefix = ActionPrefix(values, delay)
 
     def restart_clock(self) -> None:
         """Count the current frame as 0 again; what is remembered keeps its times.
@@ -380,10 +395,6 @@ class Episode:
         """
         return self._policy.sampling_noise(self._generator)
 
-    @property
-    def _memory(self) -> "MemoryModule":
-        return self._policy.require_memory()
-
     def _state_stats(self) -> QuantileStats | None:
         """Statistics of the state, once the processor has any."""
         stats = self._policy.require_processor().stats
@@ -404,7 +415,7 @@ class Episode:
         self, count: int, demo: np.ndarray, actions: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Flags [count] of the next frames and the actions that led to the execution frames among
-        them.
+        them, by default the next ones of the chunk.
         """
         demo = np.broadcast_to(demo, (count,))
         begins_again = (np.diff(demo.astype(int)) > 0).any()
@@ -413,28 +424,23 @@ class Episode:
                 "A conditioning-video frame came after the first execution frame; the video goes"
                 " first."
             )
-        return demo, self._executed_now(int((~demo).sum()), actions)
-
-    def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
-        """The actions that led to the last `count` frames; by default the next ones of
-        the chunk.
-        """
+        n_executed = int((~demo).sum())
         space = self._robot.action
         if actions is None:
             if self._chunk is None or space.frames is None:
-                return self._no_actions
-            return self._chunk[:count]
+                return demo, self._no_actions
+            return demo, self._chunk[:n_executed]
         values = finite_array(actions, "actions")
         if values.ndim:
             if space.frames is None:
-                count = len(values)
-            values = values[max(len(values) - count, 0) :]
-        if values.shape != (count, space.width):
+                n_executed = len(values)
+            values = values[max(len(values) - n_executed, 0) :]
+        if values.shape != (n_executed, space.width):
             raise UserError(
-                f"actions must be [{count}, {space.width}], one for each execution frame; got"
+                f"actions must be [{n_executed}, {space.width}], one for each execution frame; got"
                 f" {values.shape}."
             )
-        return values
+        return demo, values
 
     def _take(
         self,
@@ -446,13 +452,27 @@ class Episode:
         """Append checked frames of the memory camera to the history, and the actions that led to
         them.
         """
+        processor = self._policy.require_processor()
         if self.history is not None:
-            motion = self._motion(demo, executed, states)
+            motion: list[Tensor] = []
+            if self._policy.require_memory().uses_proprio:
+                if states is None:
+                    raise UserError(
+                        "This policy's memory reads the robot's own states and actions: give past"
+                        " frames with their states (`Episode.observe`), not as images alone."
+                    )
+                actions = np.zeros((len(demo), self._robot.action.width), np.float32)
+                known = np.zeros(len(demo), bool)
+                if self._robot.action.frames is not None:
+                    rows = np.flatnonzero(~demo)[: len(executed)]
+                    actions[rows] = executed[: len(rows)]
+                    known[rows] = True
+                motion += motion_rows(processor, states, actions, known)
             self.history.take(frames, self._policy.encode_frames)
             self._motion_of_frames += motion
             if not self._video_over:
                 self.history.exec_start = self.n_observed_frames + int(demo.sum())
-        longest = self._policy.require_processor().prompt_spec.past_actions
+        longest = processor.prompt_spec.past_actions
         past = np.concatenate([self._executed, executed])
         self._executed = past[max(len(past) - longest, 0) :]
         if self._chunk is not None:
@@ -461,25 +481,6 @@ class Episode:
             self._video_over = True
         self.n_observed_frames += len(demo)
 
-    def _motion(
-        self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None
-    ) -> list[Tensor]:
-        """Rows of motion of the next frames, if the memory reads them."""
-        if not self._memory.uses_proprio:
-            return []
-        if states is None:
-            raise UserError(
-                "This policy's memory reads the robot's own states and actions: give past frames"
-                " with their states (`Episode.observe`), not as images alone."
-            )
-        actions = np.zeros((len(demo), self._robot.action.width), np.float32)
-        known = np.zeros(len(demo), bool)
-        if self._robot.action.frames is not None:
-            rows = np.flatnonzero(~demo)[: len(executed)]
-            actions[rows] = executed[: len(rows)]
-            known[rows] = True
-        return list(motion_rows(self._policy.require_processor(), states, actions, known))
-
     def _prepared_images(self, views: Mapping[str, FrameBatch], frame: int) -> Tensor | None:
         """The views of a frame as the network takes them; None unless all cameras rendered it."""
         images = [view.image(frame) for view in views.values()]
@@ -487,9 +488,6 @@ class Episode:
         if len(rendered) < len(images):
             return None
         return self._policy.require_processor().images(rendered)
-
-    def _set_window(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:
-        self._recent = [*self._recent, *frames][-self._policy.require_processor().samples.window :]
 
     def _require_rendered(self, images: Tensor | None) -> Tensor:
         if images is None:
@@ -517,23 +515,6 @@ class Episode:
                 f" {array.shape}."
             )
         return array
-
-
-def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) -> ActionPrefix:
-    """A prefix of a chunk of `horizon` actions of `width` numbers."""
-    values = finite_array(actions, "the actions of the prefix")
-    require(
-        values.ndim == 2 and values.shape[1] == width and 1 <= len(values) <= horizon,
-        f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape"
-        f" {values.shape}.",
-    )
-    is_count = isinstance(delay, int) and not isinstance(delay, bool)
-    require(
-        is_count and 0 <= delay <= len(values),
-        f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the"
-        " actions given.",
-    )
-    return ActionPrefix(values, delay)
 
 
 def prefix_overlap(

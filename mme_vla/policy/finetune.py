@@ -64,7 +64,14 @@ def apply_finetuning(
         Trained parameters per part, adapters counted in the part they wrap.
     """
     check_choice("finetune.mode", mode, MODES)
-    check_frozen_dtype(policy, frozen_dtype)
+    if frozen_dtype is not None:
+        rounds = dtype_of(frozen_dtype, "finetune.frozen_dtype") != torch.float32
+        if rounds and policy.compute_dtype == torch.float32:
+            raise UserError(
+                f"finetune.frozen_dtype={frozen_dtype} rounds weights that"
+                " policy.compute_dtype=float32 would not: set policy.compute_dtype=bfloat16 too, or"
+                " leave frozen_dtype at null."
+            )
     spec = policy.finetune_spec
     train = ("memory", *spec.full_train) if train is None else train
     if mode == "lora":
@@ -125,18 +132,6 @@ def copy_tower(source: "Policy", policy: "Policy") -> None:
         for name, value in source.named_parameters():
             if component_of(name) == "vision" and name in targets:
                 targets[name].copy_(value)
-
-
-def check_frozen_dtype(policy: "Policy", name: str | None) -> None:
-    """Make sure that a policy can compute with frozen weights of this dtype (None: as they are)."""
-    if name is None:
-        return
-    rounds = dtype_of(name, "finetune.frozen_dtype") != torch.float32
-    if rounds and policy.compute_dtype == torch.float32:
-        raise UserError(
-            f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would"
-            " not: set policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null."
-        )
 
 
 def cast_frozen(policy: "Policy", name: str | None) -> None:

@@ -170,12 +170,16 @@ def resolve_checkpoint(path: Path) -> Path:
             f"{path} holds {len(trainings)} trainings of one recipe: name one of them, such as"
             f" {trainings[0]}. mme-vla evaluate and results take all of them."
         )
-    if _is_released(path):
-        raise UserError(
-            f"{path} is a checkpoint of the released code, in another format. Convert it, then name"
-            f" the new folder: mme-vla weights {path} {str(path).removesuffix('.zip')}_converted"
-            " (with model=<model> where no history_config.txt names the variant)."
-        )
+    # A run of the released code, a step of one, its arrays, or the zip of a step.
+    steps = [step for step in path.glob("*") if step.stem.isdigit()]
+    for step in [path, *steps]:
+        if step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir():
+            raise UserError(
+                f"{path} is a checkpoint of the released code, in another format. Convert it, then"
+                f" name the new folder: mme-vla weights {path}"
+                f" {str(path).removesuffix('.zip')}_converted (with model=<model> where no"
+                " history_config.txt names the variant)."
+            )
     require(
         str(path) not in shipped_checkpoints(),
         f"The folder {path} holds no checkpoint, and hides the one that ships under this name:"
@@ -186,17 +190,6 @@ def resolve_checkpoint(path: Path) -> Path:
         f"No checkpoint at {path}:{reason} expected a folder such as {EXAMPLE}, or the run folder"
         " above it."
     )
-
-
-def _is_released(path: Path) -> bool:
-    """Whether `path` is laid out as a run of the released code, a step of one, its arrays, or the
-    zip of a step.
-    """
-    steps = [step for step in path.glob("*") if step.stem.isdigit()]
-    for step in [path, *steps]:
-        if step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir():
-            return True
-    return False
 
 
 def newest_checkpoint(path: Path) -> Path:

@@ -97,14 +97,6 @@ def policy_options(cls: type, config: Mapping[str, Any]) -> dict[str, Any]:
     """
     options = dict(PolicySections.of(config).policy)
     options.pop("name", None)
-    known = _keyword_options(cls)
-    for key in options:
-        if key not in known:
-            raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
-    return options
-
-
-def _keyword_options(cls: type) -> list[str]:
     known: list[str] = []
     for owner in cls.__mro__:
         if "__init__" in vars(owner):
@@ -112,7 +104,11 @@ def _keyword_options(cls: type) -> list[str]:
             known += [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
             if not any(p.kind is p.VAR_KEYWORD for p in parameters):
                 break
-    return list(dict.fromkeys(known))
+    known = list(dict.fromkeys(known))
+    for key in options:
+        if key not in known:
+            raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
+    return options
 
 
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")

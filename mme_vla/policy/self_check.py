@@ -19,7 +19,7 @@ from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.episode import executable_actions
 from mme_vla.policy.tensor_files import check_header, check_values, read_safetensors
-from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.processing.normalise import QuantileStats
 from mme_vla.types import stack_noise
 from mme_vla.utils import Sums, checked_file, parse_json
 
@@ -193,12 +193,18 @@ def record_self_check(policy: "Policy") -> SelfCheck:
     if robot.conditioning_video:
         is_demo[: count // 2] = True
     states = _synthetic_rows(stats.state, count)
+    # Absolute actions [t, w] that could have led to the states.
+    relative = torch.from_numpy(_synthetic_rows(stats.actions, count))
+    past_actions = [
+        robot.action.to_absolute(row[None], torch.from_numpy(state))[0]
+        for row, state in zip(relative, states, strict=True)
+    ]
     empty = np.zeros((0, robot.action.width), np.float32)
     history = SelfCheck(
         views=views,
         states=states,
         is_demo=is_demo,
-        past_actions=_synthetic_actions(robot, stats, states),
+        past_actions=torch.stack(past_actions).float().numpy(),
         noise=policy.sampling_noise(torch.Generator().manual_seed(_SEED)),
         chunk=empty,
         actions=empty,
@@ -472,13 +478,3 @@ def _synthetic_rows(stats: QuantileStats, count: int) -> np.ndarray:
     rows = stats.mean + 0.2 * (stats.q99 - stats.q01) * np.sin(phase)
     clipped: np.ndarray = np.clip(rows, stats.q01, stats.q99).astype(np.float32)
     return clipped
-
-
-def _synthetic_actions(robot: Embodiment, stats: NormStats, states: np.ndarray) -> np.ndarray:
-    """Absolute actions [t, w] that could have led to the states."""
-    rows = torch.from_numpy(_synthetic_rows(stats.actions, len(states)))
-    absolute = [
-        robot.action.to_absolute(row[None], torch.from_numpy(state))[0]
-        for row, state in zip(rows, states, strict=True)
-    ]
-    return torch.stack(absolute).float().numpy()

@@ -46,31 +46,6 @@ def matched_methods(results: Results) -> list[tuple[Method, Method]]:
     return matched
 
 
-def matched_pairs(records: Sequence[EpisodeRecord]) -> tuple[dict[RunKey, list[Pair]], list[str]]:
-    """The pairs of every run with events, and notes on episodes that were not paired for their
-    scenes.
-
-    An episode that ended in an error has no pair.
-
-    records: merged, of both arms.
-    """
-    runs: dict[RunKey, dict[EpisodeKey, list[EpisodeRecord]]] = {}
-    for record in records:
-        if record.outcome != "error":
-            runs.setdefault(record.run, {})[record.key] = [record]
-    pairs: dict[RunKey, list[Pair]] = {}
-    notes: list[str] = []
-    for run, mine in runs.items():
-        baseline = runs.get(run._replace(event=None), {})
-        if run.event is None or not baseline:
-            continue
-        pairing = pair([mine, baseline])
-        notes += pairing.notes(str(run))
-        if pairing.keys:
-            pairs[run] = [(mine[key][0], baseline[key][0]) for key in pairing.keys]
-    return pairs, notes
-
-
 def did_not_act(record: EpisodeRecord) -> list[str]:
     """The events of a record whose place never came: a sub-task that did not begin, a step beyond
     the end.
@@ -95,15 +70,29 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
     """Of every recipe, event and task: both success rates, and which outcomes the event changed.
 
     A rate is the mean over trainings, ± its sample standard deviation. Pairs are those of all
-    trainings. p is a sign test over scenes: one is lost, or gained, where more trainings lose it
-    than gain it, or fewer.
+    trainings; an episode that ended in an error has none. p is a sign test over scenes: one is
+    lost, or gained, where more trainings lose it than gain it, or fewer.
     """
     merged = merge(records, conflicts)
     require(any(record.event for record in merged), NO_EVENTS)
+    runs: dict[RunKey, dict[EpisodeKey, list[EpisodeRecord]]] = {}
+    for record in merged:
+        if record.outcome != "error":
+            runs.setdefault(record.run, {})[record.key] = [record]
+
+    # The pairs of every recipe, and notes on episodes that were not paired for their scenes.
     groups: dict[RunKey, list[Pair]] = {}
-    matched, notes = matched_pairs(merged)
-    for run, pairs in matched.items():
-        groups.setdefault(run._replace(training=_recipe(run.training)), []).extend(pairs)
+    notes: list[str] = []
+    for run, mine in runs.items():
+        matched = runs.get(run._replace(event=None), {})
+        if run.event is None or not matched:
+            continue
+        pairing = pair([mine, matched])
+        notes += pairing.notes(str(run))
+        if pairing.keys:
+            group = groups.setdefault(run._replace(training=_recipe(run.training)), [])
+            group += [(mine[key][0], matched[key][0]) for key in pairing.keys]
+
     rows: list[list[str]] = []
     rules: set[int] = set()
     for run, pairs in groups.items():

@@ -224,7 +224,12 @@ class ChunkEnv:
         self._note_pose(observation)
         self._note_subgoal(info)
         self._note_goal(info)
-        self._add_reset_to_video(frames, count)
+        if self._video is not None:
+            for number, views in enumerate(frames.newest(count), 1):
+                caption = f"conditioning video, frame {number} of {count - 1}"
+                if number == count:
+                    caption = "step 0"
+                self._video.add(views, self._goal, caption, demo=number < count)
         self._returned = frames.blank_unrequested(images, 0)
         # Environments of other packages do not know their scene.
         self._scene = getattr(self._env, "scene_digest", NO_VALUES)
@@ -383,15 +388,6 @@ class ChunkEnv:
         )
         self._simulating = self._rendered = 0.0
         return report
-
-    def _add_reset_to_video(self, frames: "Frames", count: int) -> None:
-        if self._video is None:
-            return
-        for number, views in enumerate(frames.newest(count), 1):
-            caption = f"conditioning video, frame {number} of {count - 1}"
-            if number == count:
-                caption = "step 0"
-            self._video.add(views, self._goal, caption, demo=number < count)
 
     def _add_to_video(self, frames: "Frames", outcome: StepOutcome, subgoal: str | None) -> None:
         if self._video is None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self, Unpack
+from typing import Any, NamedTuple, Unpack
 
 from mme_vla.config.sections import read_section, without
 from mme_vla.envs.base import environment
@@ -358,10 +358,25 @@ class EvaluationRun:
 
         events: arms, such as `pause:100@subtask:2`.
         """
-        arms = [self._under(event) for event in events]
-        for arm in arms:
-            for event in arm.settings.events:
-                event.perturbation.check(self.policy)
+        # The same episodes with each event.
+        options = replace(
+            self.options,
+            times_from=self.options.times_from or self.folder,
+            show_forecast=False,
+            name=None,
+        )
+        arms = []
+        for event in events:
+            arm = replace(
+                self,
+                folder=self.folder / ("event-" + re.sub(r"[^\w.+-]", "-", event)),
+                facts=replace(self.facts, event=event),
+                settings=replace(self.settings, event=event),
+                options=options,
+            )
+            for part in arm.settings.events:
+                part.perturbation.check(self.policy)
+            arms.append(arm)
         matched = self.run()
         if not arms:
             return matched
@@ -369,26 +384,15 @@ class EvaluationRun:
         records = [record for arm in done for record in arm.records]
         return Evaluation(records, done[-1].workload, self.folder, matched.records)
 
-    def _under(self, event: str) -> Self:
-        """The same episodes with an event."""
-        options = replace(
-            self.options,
-            times_from=self.options.times_from or self.folder,
-            show_forecast=False,
-            name=None,
-        )
-        return replace(
-            self,
-            folder=self.folder / ("event-" + re.sub(r"[^\w.+-]", "-", event)),
-            facts=replace(self.facts, event=event),
-            settings=replace(self.settings, event=event),
-            options=options,
-        )
-
     def run(self) -> Evaluation:
         """Run every episode that the folder has no result of yet, the longest first."""
-        self._check()
         options = self.options
+        # Refuse what can be refused, before the folder is claimed.
+        self.policy.require_processor().require_stats()
+        check_subgoals(self.policy, options.subgoals)
+        check_sessions(self.settings.split, self.policy.info.n_distractor_episodes)
+        if options.base is make_env:
+            environment(self.settings.env).check_embodiment(self.policy.embodiment)
         decisive = run_settings(
             self.policy, self.facts, self.settings, options.subgoals, options.source
         )
@@ -420,14 +424,6 @@ class EvaluationRun:
                 if missing:
                     workload = self._roll_out(missing, workers, content, log, progress)
         return Evaluation(self._records(options.shard), workload, self.folder)
-
-    def _check(self) -> None:
-        """Refuse what can be refused, before the folder is claimed."""
-        self.policy.require_processor().require_stats()
-        check_subgoals(self.policy, self.options.subgoals)
-        check_sessions(self.settings.split, self.policy.info.n_distractor_episodes)
-        if self.options.base is make_env:
-            environment(self.settings.env).check_embodiment(self.policy.embodiment)
 
     def _records(self, shard: Shard = Shard()) -> list[EpisodeRecord]:
         """The folder's records of these episodes; of one of several shards, only its own file's."""
@@ -532,13 +528,22 @@ def run_settings(
     How many workers or shards there are, and on which machine, does not belong to it; nor does the
     batch size, though batches may change the last bits of an action.
     """
+    predictor = None
+    if subgoals is not None:
+        predictor = without(subgoals.settings, *INDIFFERENT)
+        for key in ("model", "adapter"):
+            if key in predictor:
+                predictor[key] = _end_of(predictor[key])
+        predictor |= {"name": facts.subgoal, "kind": subgoals.kind, "interval": subgoals.interval}
+        if isinstance(subgoals, BackgroundPredictor):
+            predictor["mode"] = "background"
     decisive = {
         "model": facts.model,
         "checkpoint": facts.checkpoint,
         "source": _end_of(source),
         "policy": fingerprint(dict(policy.config)),
         "dtype": str(next(policy.parameters()).dtype).removeprefix("torch."),
-        "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
+        "subgoal": predictor,
         "execute": settings.execute or policy.embodiment.action.execute,
         "flow_steps": settings.flow_steps or policy.info.sample_steps,
         "seed": settings.seed,
@@ -554,17 +559,6 @@ def run_settings(
         "only_possible": settings.only_possible,
     }
     return decisive | {name: value for name, value in optional.items() if value}
-
-
-def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, Any]:
-    decisive = without(subgoals.settings, *INDIFFERENT)
-    for key in ("model", "adapter"):
-        if key in decisive:
-            decisive[key] = _end_of(decisive[key])
-    decisive |= {"name": name, "kind": subgoals.kind, "interval": subgoals.interval}
-    if isinstance(subgoals, BackgroundPredictor):
-        decisive["mode"] = "background"
-    return decisive
 
 
 def _end_of(place: str | None) -> str | None:

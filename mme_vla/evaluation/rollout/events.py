@@ -46,33 +46,33 @@ class Event(NamedTuple):
         return (subtask if self.unit == "subtask" else step) >= self.number
 
 
-def read_event(text: str) -> Event:
-    """One event from its text.
+def read_events(text: str | None) -> tuple[Event, ...]:
+    """The events of one arm, such as `pause:100@subtask:2+gap:32@step:64`; none of None.
 
     Raises:
         UserError: another form, an unknown event, a number that it does not take, or an unknown
             place.
     """
-    key = f"event={brief(text, quote=False)}"
-    word = split_word(text)
-    if word is None:
-        raise UserError(f"{key}: {FORM}.")
-    unit = word.unit or "step"
-    number = word.number or 0
-    event = Event(text, build_word(word, ROLLOUT, key), unit, number)
-    require(
-        word.unit is None or not event.resamples_video,
-        f"{key}: {word.name} takes no place; leave out @{word.unit}:….",
-    )
-    check_choice(f"{key}: place", unit, ("step", "subtask"))
-    least = 0 if unit == "step" else 1
-    require(number >= least, f"{key}: {unit}:{number} must be {least} or more.")
-    return event
-
-
-def read_events(text: str | None) -> tuple[Event, ...]:
-    """The events of one arm, such as `pause:100@subtask:2+gap:32@step:64`; none of None."""
-    return () if text is None else tuple(map(read_event, text.split("+")))
+    if text is None:
+        return ()
+    events = []
+    for part in text.split("+"):
+        key = f"event={brief(part, quote=False)}"
+        word = split_word(part)
+        if word is None:
+            raise UserError(f"{key}: {FORM}.")
+        unit = word.unit or "step"
+        number = word.number or 0
+        event = Event(part, build_word(word, ROLLOUT, key), unit, number)
+        require(
+            word.unit is None or not event.resamples_video,
+            f"{key}: {word.name} takes no place; leave out @{word.unit}:….",
+        )
+        check_choice(f"{key}: place", unit, ("step", "subtask"))
+        least = 0 if unit == "step" else 1
+        require(number >= least, f"{key}: {unit}:{number} must be {least} or more.")
+        events.append(event)
+    return tuple(events)
 
 
 def event_arms(value: Any) -> list[str]:

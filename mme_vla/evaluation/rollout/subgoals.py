@@ -196,8 +196,10 @@ class SubgoalTrace:
         self.score.add(subgoal.text, self._meant, subgoal.queried, subgoal.problem)
         if self._folder is None:
             return
+        from PIL import Image
+
         image_name = f"{self._name}/{episode.step:05d}.jpg"
-        _save(episode.frame, self._folder / image_name)
+        Image.fromarray(episode.frame).save(self._folder / image_name, quality=90)
         line = {
             "step": episode.step,
             "seconds": round(time.perf_counter() - self._begun, 3),
@@ -219,9 +221,3 @@ class SubgoalTrace:
     def _file(self) -> Path:
         assert self._folder is not None
         return self._folder / f"{self._name}.jsonl"
-
-
-def _save(image: np.ndarray, path: Path) -> None:
-    from PIL import Image
-
-    Image.fromarray(image).save(path, quality=90)

@@ -55,7 +55,10 @@ class EpisodeVideo:
         line = " · ".join(part for part in (self._run, caption) if part)
         text = f"{goal or ''}\n{line}"
         if self._video is None:
-            self._video = self._open()
+            folder = self._path("", "").parent
+            folder.mkdir(parents=True, exist_ok=True)
+            self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
+            self._video = VideoWriter(self._draft)
             self._thread = ThreadPoolExecutor(1, "video")
         assert self._thread is not None
         self._waiting.append(self._thread.submit(self._video.add, video_frame(views, text, demo)))
@@ -95,12 +98,6 @@ class EpisodeVideo:
         if complete:
             for frame in waiting:
                 frame.result()
-
-    def _open(self) -> VideoWriter:
-        folder = self._path("", "").parent
-        folder.mkdir(parents=True, exist_ok=True)
-        self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
-        return VideoWriter(self._draft)
 
 
 def video_name(task: str, episode: int, outcome: str, goal: str) -> str:

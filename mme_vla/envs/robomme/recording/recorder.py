@@ -188,9 +188,15 @@ class Recorder:
         self._enter_phase()
         if planned.text == NO_RECORD:
             return
-        step = RecordedStep(
-            self._observation(evaluated), self._actions(planned), self._texts(planned)
-        )
+        cameras: tuple[str, ...] = CAMERAS
+        if self._render_request is not None:
+            cameras = self._render_request.cameras(self._result.stored, newest=False)
+        frame = self._observer.frame(evaluated, cameras)
+        frame = {name: value for name, value in frame.items() if value is not None}
+        frame["eef_state"] = frame["eef_state"].astype(np.float32)
+        closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
+        frame["is_gripper_close"] = closed
+        step = RecordedStep(frame, self._actions(planned), self._texts(planned))
         self._result.stored += 1
         self._result.video += planned.video
         self._facts.add(planned.video)
@@ -207,16 +213,6 @@ class Recorder:
         if self._in_video is not None and video != self._in_video:
             self._waypoint = None
         self._in_video = video
-
-    def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
-        cameras: tuple[str, ...] = CAMERAS
-        if self._render_request is not None:
-            cameras = self._render_request.cameras(self._result.stored, newest=False)
-        frame = self._observer.frame(evaluated, cameras)
-        frame = {name: value for name, value in frame.items() if value is not None}
-        frame["eef_state"] = frame["eef_state"].astype(np.float32)
-        closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
-        return frame | {"is_gripper_close": closed}
 
     def _actions(self, planned: "SubTask") -> dict[str, Any]:
         action = self._action

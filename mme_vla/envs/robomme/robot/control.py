@@ -78,7 +78,25 @@ class RobotControl:
             PlanningError: neither a screw motion nor sampling found a way; nothing has moved.
         """
         self.announce(pose, gripper)
-        self.follow(self._plan(pose))
+        velocity, acceleration = LIMITS[self.env.stick]
+        # The screw planner has no randomness: what fails once fails always.
+        qpos = np.asarray(self.env.qpos, np.float64 if self.env.stick else np.float32)
+        plan = plan_screw(self.arm, qpos, pose, velocity, acceleration, np.float32)
+        if plan is None:
+            for seed in range(FREE_TRIES):
+                detour = plan_free(self.arm, self.env.qpos, pose, velocity, acceleration, seed=seed)
+                if detour is not None and (plan is None or len(detour) < len(plan)):
+                    plan = detour
+                if plan is not None and len(plan) <= LONG_DETOUR:
+                    break
+        if plan is None:
+            place = [round(float(x), 4) for x in pose.p]
+            orientation = [round(float(x), 4) for x in pose.q]
+            raise PlanningError(
+                f"No way to {place}, orientation {orientation} (wxyz): out of the arm's reach or"
+                " blocked."
+            )
+        self.follow(plan)
 
     def follow(self, targets: Iterable[np.ndarray]) -> None:
         """Perform one control step for each row of joint targets [7]."""
@@ -137,28 +155,6 @@ class RobotControl:
         if q is None:
             q = self.env.tcp_pose.q
         return sapien.Pose(list(position), q)
-
-    def _plan(self, pose: sapien.Pose) -> np.ndarray:
-        velocity, acceleration = LIMITS[self.env.stick]
-        # The screw planner has no randomness: what fails once fails always.
-        qpos = np.asarray(self.env.qpos, np.float64 if self.env.stick else np.float32)
-        plan = plan_screw(self.arm, qpos, pose, velocity, acceleration, np.float32)
-        if plan is not None:
-            return plan
-        for seed in range(FREE_TRIES):
-            detour = plan_free(self.arm, self.env.qpos, pose, velocity, acceleration, seed=seed)
-            if detour is not None and (plan is None or len(detour) < len(plan)):
-                plan = detour
-            if plan is not None and len(plan) <= LONG_DETOUR:
-                break
-        if plan is None:
-            place = [round(float(x), 4) for x in pose.p]
-            orientation = [round(float(x), 4) for x in pose.q]
-            raise PlanningError(
-                f"No way to {place}, orientation {orientation} (wxyz): out of the arm's reach or"
-                " blocked."
-            )
-        return plan
 
     def _move_gripper(self, command: float) -> None:
         if self.env.stick:

@@ -169,7 +169,17 @@ class GripperPrimitives(RobotControl):
         mode = self.fail_next_pick
         if mode is not None:
             self.fail_next_pick = None
-            self._fail_grasp(thing, above, depth, failing_offset(mode, miss, self.env.seed))
+            # Close the fingers where the object is not, and come back up.
+            grasp = self._grasp_pose(thing, depth)
+            offset = failing_offset(mode, miss, self.env.seed)
+            wrong = sapien.Pose(grasp.p + offset, grasp.q)
+            over = self.at([*wrong.p[:2], above], grasp.q)
+            self.open()
+            self.move_to(over, OPEN)
+            self.move_to(wrong, CLOSE)
+            self.close()
+            self.move_to(over, OPEN)
+            self.open()
         grasp = self._grasp_pose(thing, depth)
         initial_height = thing.position[2]
         self._grasp_at(grasp, thing, above)
@@ -185,18 +195,6 @@ class GripperPrimitives(RobotControl):
         self.move_to(grasp, CLOSE)
         self.close()
         self.move_to(self.at([*thing.position[:2], above], grasp.q), CLOSE)
-
-    def _fail_grasp(self, thing: Thing, above: float, depth: float, offset: np.ndarray) -> None:
-        """Close the fingers where the object is not, and come back up."""
-        grasp = self._grasp_pose(thing, depth)
-        wrong = sapien.Pose(grasp.p + offset, grasp.q)
-        over = self.at([*wrong.p[:2], above], grasp.q)
-        self.open()
-        self.move_to(over, OPEN)
-        self.move_to(wrong, CLOSE)
-        self.close()
-        self.move_to(over, OPEN)
-        self.open()
 
     def _grasp_pose(self, thing: Thing, depth: float) -> sapien.Pose:
         closing = self.env.tcp_pose.to_transformation_matrix()[:3, 1]

@@ -110,33 +110,29 @@ class Arm:
         """
         target = np.linalg.inv(matrix_of(self.base)) @ matrix_of(pose)
         start = self._padded(qpos)
+        goal = pinocchio.SE3(target)
+        frame = pinocchio.ReferenceFrame.LOCAL
+        damping = _DAMPING * np.eye(6)
         random = np.random.default_rng(0)
         for _ in range(1 + _RESTARTS):
-            arm = self._iterate(target, start)
+            # Follow the displacement to the target.
+            joints = start.copy()
+            for _ in range(_ITERATIONS):
+                error = pinocchio.log6(goal.actInv(self._place(joints, self._tcp))).vector
+                if np.linalg.norm(error) < _CONVERGED:
+                    break
+                jacobian = pinocchio.computeFrameJacobian(
+                    self._model, self._data, joints, self._tcp, frame
+                )[:, :ARM_JOINTS]
+                step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping, error)
+                joints[:ARM_JOINTS] -= _STEP * step
+            arm = joints[:ARM_JOINTS].copy()
             arm -= 2 * np.pi * np.floor((arm - self.lower + LIMIT_TOLERANCE) / (2 * np.pi))
             match = sapien.Pose(self.transform(arm))
             if self.within_limits(arm) and pose_distance(match, sapien.Pose(target)) < IK_TOLERANCE:
                 return arm
             start = self._padded(random.uniform(self.lower, self.upper))
         return None
-
-    def _iterate(self, target: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Follow the displacement to a target [4, 4] from joints; the joints [7] where
-        that ended.
-        """
-        goal = pinocchio.SE3(target)
-        joints = start.copy()
-        damping = _DAMPING * np.eye(6)
-        frame = pinocchio.ReferenceFrame.LOCAL
-        for _ in range(_ITERATIONS):
-            error = pinocchio.log6(goal.actInv(self._place(joints, self._tcp))).vector
-            if np.linalg.norm(error) < _CONVERGED:
-                break
-            full = pinocchio.computeFrameJacobian(self._model, self._data, joints, self._tcp, frame)
-            jacobian = full[:, :ARM_JOINTS]
-            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping, error)
-            joints[:ARM_JOINTS] -= _STEP * step
-        return joints[:ARM_JOINTS].copy()
 
     def _place(self, joints: np.ndarray, frame: int) -> Any:
         pinocchio.forwardKinematics(self._model, self._data, joints)

@@ -275,7 +275,22 @@ def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.
     if not setup.haveExactSolutionPath():
         return None
     between = [_joints(state) for state in setup.getSolutionPath().getStates()[1:-1]]
-    return np.array(_shortened([start, *between, goal], obstacles))
+    path = [start, *between, goal]
+
+    # Leave out what a straight line can skip, then space the rest evenly, so that a spline stays
+    # near it.
+    points = [start]
+    i = 0
+    while i < len(path) - 1:
+        j = len(path) - 1
+        while j > i + 1 and not obstacles.clear_between(path[i], path[j]):
+            j -= 1
+        steps = int(np.ceil(np.linalg.norm(path[j] - path[i]) / REACH))
+        for k in range(1, steps):
+            points.append(path[i] + (path[j] - path[i]) * k / steps)
+        points.append(path[j])
+        i = j
+    return np.array(points)
 
 
 def _joints(state: Any) -> np.ndarray:
@@ -287,21 +302,3 @@ def _state(space: Any, joints: np.ndarray) -> Any:
     for joint, angle in enumerate(joints):
         state[joint] = float(angle)
     return state
-
-
-def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]:
-    """Leave out what a straight line can skip, then space the rest evenly, so that a spline stays
-    near it.
-    """
-    points = [path[0]]
-    i = 0
-    while i < len(path) - 1:
-        j = len(path) - 1
-        while j > i + 1 and not obstacles.clear_between(path[i], path[j]):
-            j -= 1
-        steps = int(np.ceil(np.linalg.norm(path[j] - path[i]) / REACH))
-        for k in range(1, steps):
-            points.append(path[i] + (path[j] - path[i]) * k / steps)
-        points.append(path[j])
-        i = j
-    return points

@@ -99,8 +99,14 @@ def description(stock: str, mount_from: str | None = None, visible: bool = True)
     for mesh in robot.iter("mesh"):
         mesh.set("filename", str(source.parent / mesh.attrib["filename"]))
     for mesh in robot.iterfind("link/visual/geometry/mesh"):
-        if Path(mesh.attrib["filename"]).name == _CAMERA_MESH:
-            mesh.set("filename", str(_coarse(Path(mesh.attrib["filename"]), caches)))
+        stock_mesh = Path(mesh.attrib["filename"])
+        if stock_mesh.name == _CAMERA_MESH:
+            # With no more detail than shows; made once.
+            key = hashlib.sha256(stock_mesh.read_bytes() + str(CELL).encode()).hexdigest()[:16]
+            coarse = caches / key / stock_mesh.name
+            if not coarse.exists():
+                _write(coarse, stl_bytes(coarsen(read_stl(stock_mesh))))
+            mesh.set("filename", str(coarse))
     text = ElementTree.tostring(robot)
     folder = caches / hashlib.sha256(text).hexdigest()[:16]
     _write(folder / source.with_suffix(".srdf").name, source.with_suffix(".srdf").read_bytes())
@@ -120,15 +126,6 @@ def _add_mount(robot: ElementTree.Element, donor: ElementTree.Element) -> None:
             for material in visual.findall("material"):
                 visual.remove(material)  # the camera is white in the official images
     robot.extend([*links, *joints])
-
-
-def _coarse(mesh: Path, caches: Path) -> Path:
-    """The mesh with no more detail than shows; made once."""
-    key = hashlib.sha256(mesh.read_bytes() + str(CELL).encode()).hexdigest()[:16]
-    coarse = caches / key / mesh.name
-    if not coarse.exists():
-        _write(coarse, stl_bytes(coarsen(read_stl(mesh))))
-    return coarse
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -63,7 +63,14 @@ def smallest_box(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
     least = math.inf
     upright = np.eye(3)
     for azimuth, inclination in _directions(normals):
-        turn = _turn_to_vertical(azimuth, inclination)
+        # The rotation that turns the direction upright.
+        cos_a, sin_a = math.cos(azimuth), math.sin(azimuth)
+        cos_i, sin_i = math.cos(inclination), math.sin(inclination)
+        turn = np.array([
+            [cos_i * cos_a, cos_i * sin_a, -sin_i],
+            [-sin_a, cos_a, 0.0],
+            [sin_i * cos_a, sin_i * sin_a, cos_i],
+        ])  # fmt: skip
         up = turn[2]
         heights = normals[:, 0] * up[0] + normals[:, 1] * up[1] + normals[:, 2] * up[2]
         visible = heights > -_SHORTEST_EDGE
@@ -98,17 +105,6 @@ def _directions(normals: np.ndarray) -> np.ndarray:
     units[np.abs(units) < _SMALLEST_COMPONENT] = 0.0
     angles = np.array([(math.atan2(y, x), math.acos(min(1.0, z))) for x, y, z in units])
     return angles[grouping.unique_rows(angles, digits=1)[0]]
-
-
-def _turn_to_vertical(azimuth: float, inclination: float) -> np.ndarray:
-    """The rotation [3, 3] that turns a direction upright."""
-    cos_a, sin_a = math.cos(azimuth), math.sin(azimuth)
-    cos_i, sin_i = math.cos(inclination), math.sin(inclination)
-    return np.array([
-        [cos_i * cos_a, cos_i * sin_a, -sin_i],
-        [-sin_a, cos_a, 0.0],
-        [sin_i * cos_a, sin_i * sin_a, cos_i],
-    ])  # fmt: skip
 
 
 def _unit_edges(ends: np.ndarray) -> np.ndarray:

@@ -114,10 +114,9 @@ class SwingXtimes(Task):
         def visits(target: Disc, side: int) -> list[Cue]:
             places = [side * TALLY_SPACING * (i + 1) for i in range(self.repetitions)]
 
-            def left() -> int:
-                return sum(target in step.targets for step in self.progress.to_come)
-
-            return tally(places, left)
+            return tally(
+                places, lambda: sum(target in step.targets for step in self.progress.to_come)
+            )
 
         return [*visits(self.right, -1), *visits(self.left, 1)]
 
