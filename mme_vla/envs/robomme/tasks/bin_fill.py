@@ -58,15 +58,13 @@ class BinFill(Task):
             "actions.streaming", lambda: draws.integer(0, 2) == 0, default=False
         )
         self.button = add_button(self, draws, (-0.2, 0))
-        dx, y, degrees = values.place(
-            "layout.board_offsets",
-            lambda: [
-                0.2 * draws.uniform() - 0.2,
-                -0.2 + 0.4 * draws.uniform(),
-                -20 + 40 * draws.uniform(),
-            ],
-            size=3,
-        )
+
+        def sample_board() -> list[float]:
+            dx = 0.2 * draws.uniform() - 0.2
+            y = -0.2 + 0.4 * draws.uniform()
+            return [dx, y, -20 + 40 * draws.uniform()]
+
+        dx, y, degrees = values.place("layout.board_offsets", sample_board, size=3)
         self.board = self.add(build_board(self, (BOARD_X + dx, y), math.radians(degrees)))
         numbers = values("objects.target_numbers", lambda: self._draw_counts(draws))
         are_counts = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)

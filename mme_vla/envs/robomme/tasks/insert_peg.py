@@ -3,7 +3,7 @@ same with that peg.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from functools import partial
@@ -123,16 +123,18 @@ class InsertPeg(Task):
     def _draw_pegs(self, draws: Draws, box: Point) -> list[tuple[Point, float]]:
         pegs: list[tuple[Point, float]] = []
         for _ in self.pegs:
-            for _ in range(TRIES):
-                place = (-0.2 + 0.4 * draws.uniform(), -0.3 + 0.6 * draws.uniform())
-                clear = all(math.dist(place, other) > FROM_PEG for other, _ in pegs)
-                if clear and math.dist(place, box) > FROM_BOX:
-                    break
-            else:
-                raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
+            place = self._draw_place(draws, box, [other for other, _ in pegs])
             pegs.append((place, math.radians(-45 + 90 * draws.uniform())))
         self.values.note("initializations.pegs", pegs)
         return pegs
+
+    def _draw_place(self, draws: Draws, box: Point, others: Sequence[Point]) -> Point:
+        for _ in range(TRIES):
+            place = (-0.2 + 0.4 * draws.uniform(), -0.3 + 0.6 * draws.uniform())
+            clear = all(math.dist(place, other) > FROM_PEG for other in others)
+            if clear and math.dist(place, box) > FROM_BOX:
+                return place
+        raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
 
     def flip_fact(self) -> dict[str, Any] | None:
         """The first two pegs, of which the video takes one, change places."""
@@ -158,16 +160,18 @@ class InsertPeg(Task):
         if self.reset_in_progress:
             for peg in self.pegs:
                 peg.displace(peg.initial_pose)
-        elif (
-            self._restoring
-            and self.second_tries
-            and np.linalg.norm(self.peg.position - self.peg.initial_pose.p) > FLUNG
-        ):
-            # The peg left at once where it was put back: it keeps what speed the hand or the box
-            # gave it. It is laid down at rest. No official episode shows that, since its
-            # demonstrator could not continue from there.
+        elif self._restoring and self.second_tries and self._flung():
             self.peg.restore()
         self._restoring = self.reset_in_progress
+
+    def _flung(self) -> bool:
+        """Whether the peg left at once where it was put back: it keeps what speed the hand or the
+        box gave it.
+
+        No official episode shows that, since its demonstrator could not continue from there; the
+        peg is laid down at rest.
+        """
+        return float(np.linalg.norm(self.peg.position - self.peg.initial_pose.p)) > FLUNG
 
     # Predicates -----------------------------------------------------------------------------------
 
@@ -182,6 +186,16 @@ class InsertPeg(Task):
         tcp = self.tcp_pose.p
         nearer = np.linalg.norm(grasped.position - tcp) < np.linalg.norm(other.position - tcp)
         return bool(grasped.position[2] > LIFTED_Z and nearer)
+
+    def _is_near(self, grasped: Thing, free: Thing) -> bool:
+        """Whether the grasped end is the nearer one: along x, or in rows of RoboMME-OOD by the
+        distance.
+        """
+        if not self.tier:
+            return bool(grasped.position[0] < free.position[0])
+        base = np.array(ROBOT_BASE)
+        distance, other = distance_xy(grasped.position, base), distance_xy(free.position, base)
+        return distance < other or (distance == other and self.end == "head")
 
     def _inside(self, thing: Thing) -> bool:
         return float(np.linalg.norm(thing.position - self.box.position)) <= INSERTED
@@ -215,13 +229,7 @@ class InsertPeg(Task):
 
     def _both(self, video: bool) -> list[SubTask]:
         grasped, free = self.ends(self.end)
-        # The nearer end from the robot's base: along x, or in rows of RoboMME-OOD by the distance.
-        is_near = grasped.position[0] < free.position[0]
-        if self.tier:
-            base = np.array(ROBOT_BASE)
-            distance, other = distance_xy(grasped.position, base), distance_xy(free.position, base)
-            is_near = distance < other or (distance == other and self.end == "head")
-        word = "near" if is_near else "far"
+        word = "near" if self._is_near(grasped, free) else "far"  # from the robot's base
         insertion = f"Insert the peg from the {SIDES[self.side]} side"
         if video:
             insertion += " of the box"

@@ -169,6 +169,9 @@ class MoveCube(Task):
     def _holds_peg(self) -> bool:
         return any_picked_up(self, (self.peg.head, self.peg.tail))
 
+    def _holds_cube(self) -> bool:
+        return picked_up(self, self.cube)
+
     def _hook(self, video: bool) -> list[SubTask]:
         return [
             SubTask(
@@ -176,7 +179,7 @@ class MoveCube(Task):
                 done=self._holds_peg,
                 run=lambda demo: demo.grasp_peg(self.peg, "tail"),
                 grounded="Pick up the peg at <>",
-                failed=lambda: picked_up(self, self.cube) or self._on_target(),
+                failed=lambda: self._holds_cube() or self._on_target(),
                 targets=[self.peg.tail],
                 choice="a",
                 video=video,
@@ -208,7 +211,7 @@ class MoveCube(Task):
             done=self._pushed,
             run=self._demonstrate_push,
             grounded="Close the gripper and push the cube at <> to the target at <>",
-            failed=lambda: picked_up(self, self.cube) or self._holds_peg(),
+            failed=lambda: self._holds_cube() or self._holds_peg(),
             targets=[self.cube, self.target],
             choice="c",
             video=video,

@@ -173,10 +173,17 @@ class PatternLock(Task):
     def _go(self, word: str, demo: Demonstrator, _: None) -> None:
         tcp = self.tcp_pose.p
         here = min(self.discs, key=lambda disc: distance_xy(disc.position, tcp))
-        # The disc within reach that lies in the direction: the best aligned, then the nearest one.
+        goal = self.disc_towards(here, word)
+        if goal is not None:
+            demo.stick_to(goal)
+
+    def disc_towards(self, here: Disc, word: str) -> Disc | None:
+        """The disc within reach that lies in a direction: the best aligned, then the
+        nearest one.
+        """
         signs = np.array(DIRECTIONS[word])
         way = signs / np.linalg.norm(signs)
-        goal: Disc | None = None
+        best: Disc | None = None
         least = (math.inf, math.inf)
         for disc in self.discs:
             step = disc.position[:2] - here.position[:2]
@@ -186,9 +193,8 @@ class PatternLock(Task):
                 continue
             preference = (round(-float(step @ way) / length, 6), length)
             if preference < least:
-                goal, least = disc, preference
-        if goal is not None:
-            demo.stick_to(goal)
+                best, least = disc, preference
+        return best
 
     def goals(self) -> list[str]:
         goal = (

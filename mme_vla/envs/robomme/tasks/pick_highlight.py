@@ -63,17 +63,7 @@ class PickHighlight(Task):
         if self.values.specified:
             count = self.values.count(part)
         for i in range(count):
-            number = len(self.cubes)
-            colour: str | RGB
-            if self.values.find("objects.color_rgba") is not None:
-                # rows of RoboMME-OOD have any colours
-                colour = self.values.colour(f"objects.color_rgba.{number}", list)
-            else:
-                colour = self.values.word(
-                    f"objects.colors.{number}",
-                    lambda: SAMPLED_COLOURS[draws.integer(0, 3)],
-                    COLOURS,
-                )
+            colour = self._colour(draws, len(self.cubes))
             cube = add_cube(
                 self,
                 draws,
@@ -85,6 +75,14 @@ class PickHighlight(Task):
                 value=f"{part}.{i}",
             )
             self.cubes.append(cube)
+
+    def _colour(self, draws: Draws, i: int) -> str | RGB:
+        """A name, or in rows of RoboMME-OOD any colour."""
+        if self.values.find("objects.color_rgba") is not None:
+            return self.values.colour(f"objects.color_rgba.{i}", list)
+        return self.values.word(
+            f"objects.colors.{i}", lambda: SAMPLED_COLOURS[draws.integer(0, 3)], COLOURS
+        )
 
     def flip_fact(self) -> dict[str, Any] | None:
         """As many of the other cubes are highlighted instead; None where there are fewer."""
@@ -132,12 +130,7 @@ class PickHighlight(Task):
     def subtasks(self) -> list[SubTask]:
         steps = [press(self.button, "press the button", "a")]
         for i, cube in enumerate(self.goal_cubes):
-            text = f"pick up the {ordinal(i)} highlighted cube"
-            if not self.tier:
-                if len(self.goal_cubes) == 1:
-                    text = "pick up the highlighted cube"
-                text += f", which is {cube.colour}"
-            steps.append(pick(self, cube, text, "b", pick=True, operation="which"))
+            steps.append(pick(self, cube, self._pick_text(i), "b", pick=True, operation="which"))
             steps.append(
                 put_down(
                     self,
@@ -151,6 +144,14 @@ class PickHighlight(Task):
         if self.tier:
             return [*steps, press(self.button, "press the button", "a")]
         return steps[:-1]  # the last cube stays in the gripper
+
+    def _pick_text(self, i: int) -> str:
+        if self.tier:
+            return f"pick up the {ordinal(i)} highlighted cube"
+        which = "highlighted cube"
+        if len(self.goal_cubes) > 1:
+            which = f"{ordinal(i)} highlighted cube"
+        return f"pick up the {which}, which is {self.goal_cubes[i].colour}"
 
     def choices(self) -> list[Choice]:
         return [

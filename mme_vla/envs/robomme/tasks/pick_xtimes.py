@@ -57,10 +57,10 @@ class PickXtimes(Task):
         self.wrong_cubes = [cube for cube in self.all_cubes if cube is not self.cube]
 
     def cues(self) -> list[Cue]:
-        return tally(
-            row(self.repetitions),
-            lambda: sum(step.choice == "b" for step in self.progress.to_come),
-        )
+        def left() -> int:
+            return sum(step.choice == "b" for step in self.progress.to_come)
+
+        return tally(row(self.repetitions), left)
 
     def subtasks(self) -> list[SubTask]:
         colour = self.cube.colour

@@ -162,6 +162,14 @@ class RouteStick(Task):
         self._way.append(np.asarray(self.tcp_pose.p[:2], np.float64))
         return False
 
+    def _turned(self, previous: Disc, goal: Disc) -> Direction:
+        """How the tool went around what lies between two discs: on which side of the chord it was
+        on average.
+        """
+        way = np.mean(self._way, axis=0) - previous.position[:2]
+        chord = goal.position[:2] - previous.position[:2]
+        return "clockwise" if chord[0] * way[1] - chord[1] * way[0] > 0 else "counterclockwise"
+
     def subtasks(self) -> list[SubTask]:
         first = self.route[0]
         approach = SubTask(
@@ -183,16 +191,8 @@ class RouteStick(Task):
             return over(self.tcp_pose.p, goal, REACH_RADIUS, REACH_HEIGHT)
 
         def failed() -> bool:
-            if any(over(self.tcp_pose.p, disc) for disc in others):
-                return True
-            if not there():
-                return False
-            # How the tool went around what lies between: on which side of the chord it was on
-            # average.
-            way = np.mean(self._way, axis=0) - previous.position[:2]
-            chord = goal.position[:2] - previous.position[:2]
-            went_clockwise = chord[0] * way[1] - chord[1] * way[0] > 0
-            return bool(went_clockwise != (direction == "clockwise"))
+            astray = any(over(self.tcp_pose.p, disc) for disc in others)
+            return astray or (there() and self._turned(previous, goal) != direction)
 
         return SubTask(
             MOVE.format(side, direction),

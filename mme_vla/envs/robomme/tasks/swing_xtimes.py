@@ -114,9 +114,10 @@ class SwingXtimes(Task):
         def visits(target: Disc, side: int) -> list[Cue]:
             places = [side * TALLY_SPACING * (i + 1) for i in range(self.repetitions)]
 
-            return tally(
-                places, lambda: sum(target in step.targets for step in self.progress.to_come)
-            )
+            def left() -> int:
+                return sum(target in step.targets for step in self.progress.to_come)
+
+            return tally(places, left)
 
         return [*visits(self.right, -1), *visits(self.left, 1)]
 

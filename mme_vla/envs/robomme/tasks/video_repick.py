@@ -74,23 +74,9 @@ class VideoRepick(Task):
         if values.specified:
             self._read_cubes(draws)
         elif self.difficulty == "hard":
-            # Cubes of three colours anywhere.
-            for _ in range(ROUNDS):
-                for i in draws.permutation(3):
-                    self._add_cube(draws, SAMPLED_COLOURS[i], TABLE)
-            target = draws.integer(0, len(self.cubes))
+            target = self._draw_many_cubes(draws)
         else:
-            # Three cubes of one colour; the target and others begin swaps.
-            equal = SAMPLED_COLOURS[draws.integer(0, 3)]
-            draws.permutation(4)  # part of the official stream, without effect
-            for anchor in rotated_anchors(draws, 3):
-                self._add_cube(draws, equal, Region(anchor, ANCHOR_HALF))
-            target = draws.permutation(3)[0]
-            initiators = [target]
-            others = [i for i in range(len(self.cubes)) if i != target]
-            for i in draws.permutation(2):
-                initiators.append(others[i])
-            initiators = initiators[: self.swap_count]
+            target, initiators = self._draw_equal_cubes(draws)
         count = len(self.cubes)
         self.cube = self.cubes[values.integer("objects.target", lambda: target, most=count - 1)]
         self.wrong_cubes = [cube for cube in self.cubes if cube is not self.cube]
@@ -121,6 +107,26 @@ class VideoRepick(Task):
             else:
                 colour = values.word(f"objects.colors.{i}", str, COLOURS)
             self._add_cube(draws, colour, TABLE)
+
+    def _draw_many_cubes(self, draws: Draws) -> int:
+        """Add cubes of three colours anywhere; the index of the target."""
+        for _ in range(ROUNDS):
+            for i in draws.permutation(3):
+                self._add_cube(draws, SAMPLED_COLOURS[i], TABLE)
+        return draws.integer(0, len(self.cubes))
+
+    def _draw_equal_cubes(self, draws: Draws) -> tuple[int, list[int]]:
+        """Add three cubes of one colour; indices of the target and of those that begin a swap."""
+        colour = SAMPLED_COLOURS[draws.integer(0, 3)]
+        draws.permutation(4)  # part of the official stream, without effect
+        for anchor in rotated_anchors(draws, 3):
+            self._add_cube(draws, colour, Region(anchor, ANCHOR_HALF))
+        target = draws.permutation(3)[0]
+        initiators = [target]
+        others = [i for i in range(len(self.cubes)) if i != target]
+        for i in draws.permutation(2):
+            initiators.append(others[i])
+        return target, initiators[: self.swap_count]
 
     def _add_cube(self, draws: Draws, colour: str | RGB, region: Region) -> None:
         i, avoid = len(self.cubes), [self.button, *self.cubes]
@@ -154,11 +160,10 @@ class VideoRepick(Task):
         return values
 
     def cues(self) -> list[Cue]:
-        repetitions = tally(
-            row(self.repetitions),
-            lambda: sum(step.choice == "b" and not step.video for step in self.progress.to_come),
-        )
-        return [under(self.cube), *repetitions]
+        def left() -> int:
+            return sum(step.choice == "b" and not step.video for step in self.progress.to_come)
+
+        return [under(self.cube), *tally(row(self.repetitions), left)]
 
     def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
         facts = super().visible_facts(ended) | active_motions(self.swaps)
@@ -175,9 +180,12 @@ class VideoRepick(Task):
         return False
 
     def subtasks(self) -> list[SubTask]:
+        return [*self._video(), *self._execution()]
+
+    def _video(self) -> list[SubTask]:
         swaps = [self._swap_wait(i) for i in range(self.swap_count)]
         self._swap_stage = swaps[0] if swaps else None
-        video = [
+        steps = [
             pick(self, self.cube, "pick up the cube", grounded="", video=True),
             put_down(
                 self, self.cube, "drop the cube on the table", "b", VIDEO_RELEASE_Z, video=True
@@ -185,18 +193,8 @@ class VideoRepick(Task):
         ]
         longer = delay(self)
         if swaps or longer:
-            video.append(go_home(self, GO_HOME_STEPS + longer))
-        execution: list[SubTask] = []
-        for i in range(self.repetitions):
-            execution += self._repetition(i)
-        stop = press(
-            self.button,
-            "press the button to finish",
-            "c",
-            failed=lambda: any_picked_up(self, self.cubes),
-            operation="how many",
-        )
-        return [*video, *swaps, end_video(self), *execution, stop]
+            steps.append(go_home(self, GO_HOME_STEPS + longer))
+        return [*steps, *swaps, end_video(self)]
 
     def _swap_wait(self, i: int) -> SubTask:
         """Hold still for a swap; in RoboMME-OOD until it ends."""
@@ -215,6 +213,19 @@ class VideoRepick(Task):
             return at_rest and bool(self.swaps) and self.steps_done >= self.swaps[i].end
 
         return SubTask("static", done, run, video=True)
+
+    def _execution(self) -> list[SubTask]:
+        steps: list[SubTask] = []
+        for i in range(self.repetitions):
+            steps += self._repetition(i)
+        stop = press(
+            self.button,
+            "press the button to finish",
+            "c",
+            failed=lambda: any_picked_up(self, self.cubes),
+            operation="how many",
+        )
+        return [*steps, stop]
 
     def _repetition(self, i: int) -> list[SubTask]:
         return [

@@ -172,27 +172,7 @@ class VideoPlace(Task):
             )
             steps += [self.show_pick(self.cube), drop]
         home = go_home(self, GO_HOME_STEPS + delay(self))
-        cube, target = self.cube, self.goal_target
-        wrong_cubes = [other for other in self.cubes if other is not cube]
-        wrong_targets = [other for other in self.targets if other is not target]
-        execution = [
-            pick(
-                self,
-                cube,
-                "pick up the cube",
-                failed=lambda: any_picked_up(self, wrong_cubes),
-                pick=True,
-            ),
-            place(
-                self,
-                cube,
-                target,
-                "place the cube onto the correct target",
-                failed=lambda: any(dropped_onto(self, cube, wrong) for wrong in wrong_targets),
-                operation=self.operation,
-            ),
-        ]
-        return [*steps, home, self._swap_stage, end_video(self), *execution]
+        return [*steps, home, self._swap_stage, end_video(self), *self._execution()]
 
     def put_back(self, cube: Cube) -> list[SubTask]:
         """Pick the cube up in the video and put it where it stood at first, as in RoboMME-OOD."""
@@ -216,6 +196,28 @@ class VideoPlace(Task):
     def show_press(self) -> SubTask:
         """The video's press of the button."""
         return press(self.button, "press the button", "c", grounded="", video=True)
+
+    def _execution(self) -> list[SubTask]:
+        cube, target = self.cube, self.goal_target
+        wrong_cubes = [other for other in self.cubes if other is not cube]
+        wrong_targets = [other for other in self.targets if other is not target]
+        return [
+            pick(
+                self,
+                cube,
+                "pick up the cube",
+                failed=lambda: any_picked_up(self, wrong_cubes),
+                pick=True,
+            ),
+            place(
+                self,
+                cube,
+                target,
+                "place the cube onto the correct target",
+                failed=lambda: any(dropped_onto(self, cube, wrong) for wrong in wrong_targets),
+                operation=self.operation,
+            ),
+        ]
 
     def choices(self) -> list[Choice]:
         return [
