@@ -133,7 +133,15 @@ def run(args: argparse.Namespace) -> None:
         raise UserError(
             "Name files or folders of episode records, or --demo for synthetic ones (not both)."
         )
-    _check_outputs(args)
+    # What is no earlier output, such as records, is not written over.
+    for path, suffixes in (
+        (args.csv, (".csv", ".txt")),
+        (args.latex, (".tex", ".txt")),
+        (args.markdown, (".md", ".txt")),
+        (args.html, (".html", ".htm")),
+    ):
+        if path is not None:
+            require_replaceable(path, *suffixes)
     if args.episodes is not None:
         check_episodes(read_episodes(args.episodes), "--episodes")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
@@ -306,18 +314,6 @@ def show_tables(
     if args.html:
         texts[args.html] = html_page(args.title, sections, notes=notes)
     _write(texts)
-
-
-def _check_outputs(args: argparse.Namespace) -> None:
-    """Refuse to write over what is no earlier output, such as records, before anything is read."""
-    for path, suffixes in (
-        (args.csv, (".csv", ".txt")),
-        (args.latex, (".tex", ".txt")),
-        (args.markdown, (".md", ".txt")),
-        (args.html, (".html", ".htm")),
-    ):
-        if path is not None:
-            require_replaceable(path, *suffixes)
 
 
 def _write(texts: dict[Path, str]) -> None:

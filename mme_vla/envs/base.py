@@ -96,15 +96,16 @@ class Environment(ABC):
         yield from ()
 
     def hold(self, env: Any) -> Any:
-        """The action that keeps the robot where it is, for events in which it pauses.
+        """The action that keeps the robot where it is, for events in which it pauses, and choices
+        that are carried out already.
 
         Raises:
             UserError: the environment has none.
         """
         require(
             False,
-            f"{type(self).__name__} cannot pause: implement hold(env), the action that keeps the"
-            " robot.",
+            f"{type(self).__name__} cannot pause, as an event or a choice without actions asks for:"
+            " implement hold(env), the action that keeps the robot where it is.",
         )
 
     def choices(self, env: Any) -> Mapping[str, Actions]:
@@ -385,7 +386,8 @@ class EpisodeEnv:
             parts = self._choices[action["choice"].lower()]
         remaining = iter(parts)
         part = next(remaining, _END)
-        require(part is not _END, f"{self.spec.task}: what was chosen has no actions.")
+        if part is _END:  # what was chosen is done already: a step passes, or none ever would
+            part = self.hold_action
         frames = []
         total = 0.0
         while part is not _END:

@@ -278,19 +278,16 @@ class Task(Stage):
             self.start_episode(self.draws)
             subtasks = self.subtasks()
             if self.recovery and (attempt == 0 or self.recovery_sampled_per_episode):
-                self._sample_failed_pick(subtasks)
+                self.failed_pick = None
+                picks = sum(subtask.pick and not subtask.video for subtask in subtasks)
+                if picks:
+                    self.failed_pick = self.values.integer(
+                        "actions.failed_pick",
+                        lambda: self.draw_failed_pick(self.draws, picks),
+                        most=picks - 1,
+                    )
         self.progress = Progress(subtasks, self.latch_failure)
         self._show_cues()
-
-    def _sample_failed_pick(self, subtasks: Sequence[SubTask]) -> None:
-        picks = sum(subtask.pick and not subtask.video for subtask in subtasks)
-        self.failed_pick = None
-        if picks:
-            self.failed_pick = self.values.integer(
-                "actions.failed_pick",
-                lambda: self.draw_failed_pick(self.draws, picks),
-                most=picks - 1,
-            )
 
     def scene_values(self) -> dict[str, Any]:
         """The row of this scene: `make_env` builds the same scene from it, to the last bit."""

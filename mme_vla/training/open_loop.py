@@ -264,10 +264,18 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     scaled = result.error(result.predicted) / result.scale
     scaled_best = result.baseline_error(best) / result.scale
     time = result.steps[:, None] + np.arange(result.recorded.shape[1])
+    known_times, first = np.unique(time[result.valid], return_index=True)
+    gaps = np.flatnonzero(np.diff(known_times) > 1) + 1
     labels: dict[str, Any] = {}
     for d, panel in enumerate(panels[:width]):
-        line = _unbroken(time, result.recorded[..., d], result.valid)
-        (labels["recorded"],) = panel.plot(*line, color=FAINT, lw=2.2)
+        # Chunks may overlap: one line, cut only where no chunk tells what was recorded.
+        values = result.recorded[..., d][result.valid].astype(float)[first]
+        (labels["recorded"],) = panel.plot(
+            np.insert(known_times.astype(float), gaps, np.nan),
+            np.insert(values, gaps, np.nan),
+            color=FAINT,
+            lw=2.2,
+        )
         for i, valid in enumerate(result.valid):
             known = int(valid.sum())
             executed = min(result.execute, known)
@@ -306,18 +314,6 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
         list(labels.values()), list(labels), loc="lower right", ncols=len(labels), frameon=False
     )
     figure.savefig(path, dpi=110)
-
-
-def _unbroken(
-    time: np.ndarray, values: np.ndarray, valid: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Chunks [n, h], which may overlap, as one line that is cut only where no chunk tells what was
-    recorded.
-    """
-    t, first = np.unique(time[valid], return_index=True)
-    y = values[valid].astype(float)[first]
-    gaps = np.flatnonzero(np.diff(t) > 1) + 1
-    return np.insert(t.astype(float), gaps, np.nan), np.insert(y, gaps, np.nan)
 
 
 NAME_WIDTH = 18

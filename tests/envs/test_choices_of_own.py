@@ -120,13 +120,16 @@ def test_choices_that_cannot_be_offered_are_refused(
         rails.open("Go", "train", 0, action_space=CHOICES).reset()
 
 
-def test_a_choice_whose_generator_ends_at_once_is_refused(
+def test_a_choice_that_is_carried_out_already_takes_a_step(
     rails: Environment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Rails, "choices", lambda self, env: {"stay": drive(env, 0.0)})
     env = rails.open("Go", "train", 0, action_space=CHOICES)
     env.reset()
-    with pytest.raises(UserError, match="what was chosen has no actions"):
+    frames, *_, report = env.step({"choice": "a"})
+    assert frames["state_list"] == [0] and report["status"] == "ongoing"
+    monkeypatch.delattr(Rails, "hold")
+    with pytest.raises(UserError, match="Rails cannot pause, as .* a choice without actions"):
         env.step({"choice": "a"})
 
 

@@ -275,7 +275,13 @@ def aggregate(
     if protocol.errors == "missing":
         included = [r for r in inside if r.outcome != "error"]
     there = Protocol.of_records(selected)
-    listed = [f"{task} {_numbers_text(there.numbers_of(task))}" for task in there.tasks]
+    listed = []
+    for task in there.tasks:
+        numbers = there.numbers_of(task)  # ascending
+        text = ",".join(map(str, numbers))
+        if len(numbers) > 2 and len(numbers) == numbers[-1] - numbers[0] + 1:
+            text = f"{numbers[0]}-{numbers[-1]}"  # as `episodes=` takes them
+        listed.append(f"{task} {text}")
     require(
         included,
         f"None of the {len(selected)} records is of the tasks and episodes asked for; they are of"
@@ -296,13 +302,6 @@ def aggregate(
     notes = _tell_apart(methods)
     notes += _notes(methods, protocol, len(selected) - len(inside))
     return Results(methods, protocol, notes)
-
-
-def _numbers_text(numbers: Sequence[int]) -> str:
-    """Numbers of episodes, ascending, as `episodes=` takes them: `0-9`, or `0,4,5`."""
-    if len(numbers) > 2 and len(numbers) == numbers[-1] - numbers[0] + 1:
-        return f"{numbers[0]}-{numbers[-1]}"
-    return ",".join(map(str, numbers))
 
 
 def _method_key(run: RunKey) -> RunKey:

@@ -114,7 +114,18 @@ def run_audit(
         elif not policy.embodiment.action.choice and not recordings:
             why = NEEDS["recordings"]
         if why is None:
-            _run_floor(policy, plan, folder / RANDOM, facts, settings, options)
+            # The scenes with chunks that are taken at random.
+            floor = RandomPolicy(policy, plan.lend).eval()
+            of_floor = RunFacts(
+                RANDOM,
+                "untrained",
+                settings.seed,
+                facts.split,
+                facts.max_steps,
+                event=facts.event,
+            )
+            quiet = replace(options, source=None, name=RANDOM, show_forecast=False)
+            EvaluationRun(floor, plan.jobs, folder / RANDOM, of_floor, settings, quiet).run()
             references[RANDOM] = str(folder / RANDOM)
         else:
             notes.append(f"{RANDOM} was left out: it needs {why}.")
@@ -123,23 +134,6 @@ def run_audit(
     conclusion = conclude(card, audit.resolve)
     _write(card, conclusion, folder, policy)
     return Audit(card, conclusion, folder / PAGE)
-
-
-def _run_floor(
-    policy: Policy,
-    plan: ProbePlan,
-    folder: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    options: RunOptions,
-) -> None:
-    """Run the scenes with chunks that are taken at random."""
-    floor = RandomPolicy(policy, plan.lend).eval()
-    of_floor = RunFacts(
-        RANDOM, "untrained", settings.seed, facts.split, facts.max_steps, event=facts.event
-    )
-    quiet = replace(options, source=None, name=RANDOM, show_forecast=False)
-    EvaluationRun(floor, plan.jobs, folder, of_floor, settings, quiet).run()
 
 
 def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:

@@ -340,9 +340,14 @@ class _Collector(Rollout):
         actions = selection.actions.copy()
         for i, running in enumerate(batch):
             oracle = self._oracle.get(running)
-            if self.oracle_share and oracle is not None and self._oracle_acts(running):
-                actions[i] = oracle
-                running.episode.acted(actions[i])
+            if self.oracle_share and oracle is not None:
+                # A function of seed, episode and number of the decision
+                number = len(self._decisions[running])
+                job = running.job
+                key = [self.settings.seed, job.episode, number, *job.task.encode()]
+                if np.random.default_rng(key).random() < self.oracle_share:
+                    actions[i] = oracle
+                    running.episode.acted(actions[i])
             decision = _Decision(
                 running.episode.state, selection.chunk[i], actions[i][:execute], oracle
             )
@@ -354,15 +359,6 @@ class _Collector(Rollout):
                 decision.path = path.states[i].cpu()
             self._decisions[running].append(decision)
         return actions
-
-    def _oracle_acts(self, running: RunningEpisode) -> bool:
-        """Whether the oracle takes this decision; a function of seed, episode and number of the
-        decision.
-        """
-        job = running.job
-        number = len(self._decisions[running])
-        rng = np.random.default_rng([self.settings.seed, job.episode, number, *job.task.encode()])
-        return bool(rng.random() < self.oracle_share)
 
     def on_end(self, running: RunningEpisode, ending: Ending) -> None:
         """Make a trajectory of the episode, unless it is tried again."""
