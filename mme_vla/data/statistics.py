@@ -66,8 +66,12 @@ def compute_norm_stats(
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):
         for episode in range(len(source)) if episodes is None else episodes[i]:
-            own = _steps_of(source, int(episode), video).astype(np.int32)
-            parts.append(np.stack([np.full_like(own, i), np.full_like(own, episode), own], axis=1))
+            counted = _steps_of(source, int(episode), video).astype(np.int32)
+            parts.append(
+                np.stack(
+                    [np.full_like(counted, i), np.full_like(counted, episode), counted], axis=1
+                )
+            )
     steps = np.concatenate(parts)
     require(
         len(steps) >= 2,

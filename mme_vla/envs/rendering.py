@@ -227,11 +227,11 @@ def links_culled(env: "BaseEnv", camera: "RenderCamera") -> Iterator[None]:
     corners = np.stack([boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1)
 
     # Which boxes lie beyond one edge of the image [n].
-    seen_by = camera._render_cameras[0]
-    view = seen_by.global_pose.inv().to_transformation_matrix()
+    render_camera = camera._render_cameras[0]
+    view = render_camera.global_pose.inv().to_transformation_matrix()
     # each [n, 8]
     x, y, z = np.moveaxis(corners @ view[:3, :3].T + view[:3, 3], -1, 0)  # forward, left, up
-    right, top = x * np.tan(seen_by.fovx / 2), x * np.tan(seen_by.fovy / 2)
+    right, top = x * np.tan(render_camera.fovx / 2), x * np.tan(render_camera.fovy / 2)
     outside = np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN  # [4, n, 8]
     beyond = np.any(np.all(outside, axis=-1), axis=0)
 

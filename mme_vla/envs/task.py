@@ -8,6 +8,7 @@ Everything else is here.
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -283,7 +284,7 @@ class Task(Stage):
                 if picks:
                     self.failed_pick = self.values.integer(
                         "actions.failed_pick",
-                        lambda: self.draw_failed_pick(self.draws, picks),
+                        partial(self.draw_failed_pick, self.draws, picks),
                         most=picks - 1,
                     )
         self.progress = Progress(subtasks, self.latch_failure)

@@ -129,7 +129,7 @@ def test_a_choice_that_is_carried_out_already_takes_a_step(
     frames, *_, report = env.step({"choice": "a"})
     assert frames["state_list"] == [0] and report["status"] == "ongoing"
     monkeypatch.delattr(Rails, "hold")
-    with pytest.raises(UserError, match="Rails cannot pause, as .* a choice without actions"):
+    with pytest.raises(UserError, match=r"Rails cannot pause, as .* a choice without actions"):
         env.step({"choice": "a"})
 
 

@@ -321,7 +321,7 @@ def test_a_custom_environment_names_the_action_that_keeps_its_robot() -> None:
     )
     assert env.oracle() is None, "this environment has no script"
     Braked().check_hold()
-    with pytest.raises(UserError, match="Rails cannot pause, as .*: implement hold"):
+    with pytest.raises(UserError, match=r"Rails cannot pause, as .*: implement hold"):
         Rails().check_hold()
 
 
