@@ -330,7 +330,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--demonstrations", type=int, default=40, help="of each task")
     parser.add_argument("--scenes", type=int, default=150, help="of each task for the vision tower")
     parser.add_argument("--tower-steps", type=int, default=400, help="updates of the vision tower")
-    parser.add_argument("--steps", type=int, default=400, help="updates of a training")
+    parser.add_argument("--steps", type=int, default=800, help="updates of a training")
     parser.add_argument("--episodes", type=int, default=10, help="test scenes of each task")
     parser.add_argument("--pairs", type=int, default=1, help="pairs of twins of each task")
     parser.add_argument(
