@@ -170,15 +170,7 @@ def demo_records(
             levels = [_LEVELS[e % 4] for e in range(episodes)]
             ease = np.random.default_rng([number]).normal(scale=1.5, size=episodes)
             ease += [_EASE[level] for level in levels]
-            # Each episode's chance: a logistic of its ease, moved until the mean is the paper's.
-            low, high = -30.0, 30.0
-            for _ in range(60):
-                middle = (low + high) / 2
-                chances = 1 / (1 + np.exp(-(ease + middle)))
-                if chances.mean() < result.mean / 100:
-                    low = middle
-                else:
-                    high = middle
+            chances = _chances(ease, result.mean / 100)
             for checkpoint in checkpoints:
                 for seed in seeds:
                     rng = np.random.default_rng(
@@ -206,3 +198,16 @@ def demo_records(
                         )
                         records.append(record)
     return records
+
+
+def _chances(ease: np.ndarray, rate: float) -> np.ndarray:
+    """Each episode's chance: a logistic of its ease, moved until the mean is `rate`."""
+    low, high = -30.0, 30.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        chances = 1 / (1 + np.exp(-(ease + middle)))
+        if chances.mean() < rate:
+            low = middle
+        else:
+            high = middle
+    return chances
