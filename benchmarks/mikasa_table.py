@@ -155,10 +155,10 @@ def measure(args: argparse.Namespace, run: Run | None = None) -> list[dict[str, 
             if missing:
                 units.append((model, seed, missing))
     with ThreadPoolExecutor(args.jobs) as pool:
-        running = [pool.submit(_rows_of, unit, args, run) for unit in units]
+        futures = [pool.submit(_rows_of, unit, args, run) for unit in units]
         try:
-            for unit in as_completed(running):
-                write_table(table, [*read_table(table), *unit.result()])
+            for future in as_completed(futures):
+                write_table(table, [*read_table(table), *future.result()])
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)  # what has not begun
             raise

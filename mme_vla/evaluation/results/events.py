@@ -83,15 +83,15 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
     # The pairs of every recipe, and notes on episodes that were not paired for their scenes.
     groups: dict[RunKey, list[Pair]] = {}
     notes: list[str] = []
-    for run, mine in runs.items():
+    for run, disturbed in runs.items():
         matched = runs.get(run._replace(event=None), {})
         if run.event is None or not matched:
             continue
-        pairing = pair([mine, matched])
+        pairing = pair([disturbed, matched])
         notes += pairing.notes(str(run))
         if pairing.keys:
             group = groups.setdefault(run._replace(training=_recipe(run.training)), [])
-            group += [(mine[key][0], matched[key][0]) for key in pairing.keys]
+            group += [(disturbed[key][0], matched[key][0]) for key in pairing.keys]
 
     rows: list[list[str]] = []
     rules: set[int] = set()
