@@ -3,7 +3,7 @@ weights.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -102,6 +102,11 @@ def identity_of(config: Mapping[str, Any]) -> TrainingIdentity | None:
     if section is None:
         return None
     return read_section(TrainingIdentity, section, KEY)
+
+
+def without_seed(training: TrainingIdentity | None) -> TrainingIdentity | None:
+    """What the trainings of one recipe share, whatever their seeds."""
+    return None if training is None else replace(training, seed=None, weights=None)
 
 
 def weights_digest(folder: Path) -> str | None:

@@ -40,6 +40,7 @@ from mme_vla.evaluation.results.scopes import (
     tasks_of,
 )
 from mme_vla.evaluation.results.statistics import Interval, bootstrap, mean_interval, mean_std
+from mme_vla.policy.training_identity import without_seed
 
 
 def record_table(records: Sequence[EpisodeRecord]) -> pd.DataFrame:
@@ -306,9 +307,7 @@ def aggregate(
 
 def _method_key(run: RunKey) -> RunKey:
     """What the runs of one method share: not the checkpoint, the seeds or the split."""
-    training = run.training
-    if training is not None:
-        training = replace(training, seed=None, weights=None)
+    training = without_seed(run.training)
     # Shipped policies of one recipe, such as two sizes, are two methods.
     checkpoint = run.checkpoint if run.is_shipped else ""
     return run._replace(checkpoint=checkpoint, model_seed=0, split="", training=training)

@@ -19,7 +19,7 @@ from mme_vla.evaluation.results.curves import Curves, Place, curves_of
 from mme_vla.evaluation.results.statistics import sign_test
 from mme_vla.evaluation.results.tables import Table
 from mme_vla.memory.perturbation import split_word
-from mme_vla.policy.training_identity import TrainingIdentity
+from mme_vla.policy.training_identity import TrainingIdentity, without_seed
 from mme_vla.registry import PERTURBATIONS
 
 Pair = tuple[EpisodeRecord, EpisodeRecord]
@@ -90,7 +90,7 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
         pairing = pair([disturbed, matched])
         notes += pairing.notes(str(run))
         if pairing.keys:
-            group = groups.setdefault(run._replace(training=_recipe(run.training)), [])
+            group = groups.setdefault(run._replace(training=without_seed(run.training)), [])
             group += [(disturbed[key][0], matched[key][0]) for key in pairing.keys]
 
     rows: list[list[str]] = []
@@ -111,11 +111,6 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
     return Table(
         "Events beside their matched arms", columns, rows, rules - {len(rows)}, notes=notes
     )
-
-
-def _recipe(training: TrainingIdentity | None) -> TrainingIdentity | None:
-    """What trainings with other seeds share."""
-    return None if training is None else replace(training, seed=None, weights=None)
 
 
 def _counts(pairs: Sequence[Pair]) -> list[str]:
@@ -153,7 +148,7 @@ def event_curves(
     """
     merged = []
     for record in merge(records, conflicts):
-        merged.append(replace(record, training=_recipe(record.training)))
+        merged.append(replace(record, training=without_seed(record.training)))
     return curves_of(merged, _place, confidence, same_scenes=True)
 
 
