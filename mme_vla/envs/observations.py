@@ -17,7 +17,6 @@ from mme_vla.errors import check_known, require
 
 if TYPE_CHECKING:
     import gymnasium
-    from mani_skill.utils.structs.render_camera import RenderCamera
     from torch import Tensor
 
     from mme_vla.envs.task import Task
@@ -227,25 +226,23 @@ def read_images(
     task: "Task", camera: str, rgb: bool = False, depth: bool = False, segmentation: bool = False
 ) -> dict[str, np.ndarray]:
     """What a camera last captured: `rgb`, `depth` and `segmentation`, each [256, 256, channels]."""
+    import torch
+
     sensor = task.scene.sensors[SENSORS[camera]]
+    on_cpu = sensor.camera.scene.backend.render_backend == "sapien_cpu"
     shader = sensor.config.shader_config
     images: dict[str, Tensor] = {}
     flags = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
     requested = {name for name, flag in flags.items() if flag}
     for texture, kinds in shader.texture_names.items():
-        if requested.intersection(kinds):
-            images |= shader.texture_transforms[texture](_read_texture(sensor.camera, texture))
+        if not requested.intersection(kinds):
+            continue
+        if on_cpu:  # ManiSkill's own copy takes 8 ms
+            picture = torch.from_numpy(sensor.camera._render_cameras[0].get_picture(texture))
+        else:
+            picture = sensor.camera.get_picture(texture)[0][0]
+        images |= shader.texture_transforms[texture](picture)
     return {name: np.ascontiguousarray(images[name].cpu().numpy()) for name in requested}
-
-
-def _read_texture(camera: "RenderCamera", name: str) -> "Tensor":
-    """A texture [256, 256, channels] of the last image."""
-    if camera.scene.backend.render_backend == "sapien_cpu":
-        import torch
-
-        # ManiSkill's own copy takes 8 ms
-        return torch.from_numpy(camera._render_cameras[0].get_picture(name))
-    return camera.get_picture(name)[0][0]
 
 
 def front_extrinsic() -> np.ndarray:
