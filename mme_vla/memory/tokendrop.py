@@ -131,19 +131,22 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
     This is what a heap of that size holds after all frames have passed; the first frame's patches
     rank highest.
     """
-    is_candidate = scores.values >= THRESHOLD
+    # The first frame's patches are added below, also where a scorer scores that frame.
+    is_later = scores.frames > 0
+    frames = scores.frames[is_later]
+    values = scores.values[is_later]
+    is_candidate = values >= THRESHOLD
     # Sort no more patches than can stay beside the first frame's, however long the episode is.
     # Where none can, the last line of this function leaves them all out.
     n_others = max(limit - patches, 0)
     if np.count_nonzero(is_candidate) > n_others > 0:
-        values = scores.values.reshape(-1)
-        nth = len(values) - n_others
-        is_candidate &= scores.values >= np.partition(values, nth)[nth]
+        nth = values.size - n_others
+        is_candidate &= values >= np.partition(values.reshape(-1), nth)[nth]
     row, patch = np.nonzero(is_candidate)
     first_frame_scores = np.full(patches, FIRST_FRAME_SCORE, np.float32)
-    frame = np.concatenate([np.zeros(patches, np.int64), scores.frames[row]])
+    frame = np.concatenate([np.zeros(patches, np.int64), frames[row]])
     patch = np.concatenate([np.arange(patches), patch])
-    score = np.concatenate([first_frame_scores, scores.values[is_candidate]])
+    score = np.concatenate([first_frame_scores, values[is_candidate]])
     order = np.lexsort((patch, frame, score))[-limit:]
     return np.stack([frame[order], patch[order]], axis=1)
 

@@ -150,6 +150,9 @@ def check_selection(memory: Memory, frames: int) -> None:
         assert (np.diff(selection[:, 0]) >= 0).all(), (
             f"at step {step} the selection is not in time order."
         )
+        assert len(np.unique(selection, axis=0)) == len(selection), (
+            f"at step {step} select chose a patch twice."
+        )
         stored = set(memory.storage.stored_frames(step + 1).tolist())
         # A memory that reads states may select frames that have no tokens.
         selected_frames = set() if memory.uses_proprio else set(selection[:, 0].tolist())

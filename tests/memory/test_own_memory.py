@@ -23,7 +23,7 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.registry import MEMORIES
 from mme_vla.testing import check_memory
-from mme_vla.testing.small import open_gates, random_batch, unit_stats
+from mme_vla.testing.small import moving_frames, open_gates, random_batch, unit_stats
 
 EXAMPLE = REPOSITORY / "examples" / "last_frames"
 
@@ -73,6 +73,25 @@ def rules(monkeypatch, tmp_path):
 @pytest.mark.parametrize("name", ["recent_changes", "contrast"])
 def test_the_pages_rules_pass_the_check(rules, name):
     check_memory(name, budget=64, grid=4, stride=4)
+
+
+def test_a_scorer_of_the_first_frame_does_not_take_the_budget_twice(rules):
+    """`Contrast` scores frame 0, whose patches are kept anyway."""
+    memory = rules.ContrastDrop(64, 32, budget=40, grid=4, stride=4)
+    history = OnlineHistory(memory.storage, memory.make_scorer())
+    history.append(moving_frames(24), torch.zeros(len(history.to_encode(24)), 16, 64))
+    selection = memory.select(history, 23)
+    assert len(np.unique(selection, axis=0)) == len(selection) == 40
+
+
+def test_a_patch_that_is_chosen_twice_fails_the_check(rules, monkeypatch):
+    def first_twice(*args):
+        selection = TokenDrop.select(*args)
+        return selection[[0, *range(len(selection) - 1)]]
+
+    monkeypatch.setattr(rules.RecentChanges, "select", first_twice)
+    with pytest.raises(AssertionError, match="select chose a patch twice"):
+        check_memory("recent_changes", budget=64, grid=4, stride=4)
 
 
 def test_a_new_ranking_keeps_the_cache_and_new_scores_have_their_own(rules):
