@@ -284,8 +284,9 @@ class ReadsLabels:
     """Capability of a memory, an integration or a backbone: it learns from labels of the dataset.
 
     reads_labels: columns of numbers in the dataset: `subtask_boundary` (1 where a sub-task begins,
-        else 0) or `subtask_index` (how many sub-tasks have begun). A memory has them by frame in
-        `HistoryTokens.labels`, the others of the current frame in `Batch.labels`.
+        else 0), `subtask_index` (how many sub-tasks have begun), and the same of facts,
+        `fact_visible` and `fact_index`. A memory has them by frame in `HistoryTokens.labels`, the
+        others of the current frame in `Batch.labels`.
     """
 
     reads_labels: Sequence[str] = ()

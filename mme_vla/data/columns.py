@@ -5,14 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import torch
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.lerobot_files import parquet_files
-from mme_vla.errors import UserError, check_known, listed, require
+from mme_vla.data.lerobot_files import FACTS, parquet_files
+from mme_vla.errors import UserError, brief, check_known, listed, require
 from mme_vla.types import HistoryTokens, Labels
 
 BOUNDARY = "subtask_boundary"
@@ -21,6 +22,12 @@ BOUNDARY = "subtask_boundary"
 """
 SUBTASK = "subtask_index"
 """The label that counts the sub-tasks that have begun in an episode so far, from 1."""
+FACT = "fact_index"
+"""The label that counts the facts that an episode has begun to show so far, from the dataset's
+table of facts.
+"""
+FACT_VISIBLE = "fact_visible"
+"""The label that is 1 at frames that show a fact and 0 elsewhere."""
 
 
 def with_labels(
@@ -44,21 +51,22 @@ def with_labels(
 def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
     """A label of every frame of a dataset, [rows] or [rows, k] float32.
 
-    A column of numbers, `subtask_boundary`, or `subtask_index`.
+    A column of numbers, `subtask_boundary`, `subtask_index`, `fact_index`, or `fact_visible`.
 
     Args:
         key: what names the column, for messages (`data.weights`).
 
     Raises:
         UserError: no such column, or a value that is missing, not finite or of another size; it
-            names the episode.
+            names the episode. No table of facts, or one that contradicts the dataset.
     """
     if name == BOUNDARY:
         return _boundaries(source, name)
     if name == SUBTASK:
-        begun = np.cumsum(_boundaries(source, name))
-        first = np.cumsum(source.lengths) - source.lengths
-        return (begun - np.repeat(begun[first] - 1, source.lengths)).astype(np.float32)
+        return _counts(source, _boundaries(source, name))
+    if name in (FACT, FACT_VISIBLE):
+        begins, is_visible = _facts(source, key)
+        return _counts(source, begins) if name == FACT else is_visible
     column = _read(source, name, key)
     values = column.combine_chunks()
     nested = pa.types.is_list(values.type) or pa.types.is_large_list(values.type)
@@ -106,7 +114,15 @@ def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
     """The first frames of sub-tasks, [rows] float32: where the text of `simple_subgoal` changes."""
     name = "simple_subgoal"
     key = f"the label {label}"
-    subgoals = _read(source, name, key)
+    try:
+        subgoals = _read(source, name, key)
+    except UserError as error:
+        if not (source.root / FACTS).is_file():
+            raise
+        raise UserError(
+            f"{error} {source.name} has facts: the label {FACT} counts them"
+            f" (memory.label={FACT} for memory=keyframes)."
+        ) from None
     require(
         pa.types.is_string(subgoals.type) or pa.types.is_large_string(subgoals.type),
         f"{key}: the column {name!r} of {source.name} holds {subgoals.type}, no texts.",
@@ -116,6 +132,42 @@ def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
     begins = np.concatenate([[True], np.diff(codes) != 0])
     begins[np.cumsum(source.lengths) - source.lengths] = True
     return begins.astype(np.float32)
+
+
+def _counts(source: EpisodeSource, begins: np.ndarray) -> np.ndarray:
+    """How many have begun in its episode up to each frame, itself included, [rows] float32.
+
+    begins: how many begin at each frame, [rows].
+    """
+    begun = np.cumsum(begins)
+    first = np.cumsum(source.lengths) - source.lengths
+    before = begun[first] - begins[first]
+    return (begun - np.repeat(before, source.lengths)).astype(np.float32)
+
+
+def _facts(source: EpisodeSource, key: str) -> tuple[np.ndarray, np.ndarray]:
+    """How many facts each frame is the first to show, and whether it shows any, [rows] float32."""
+    path = source.root / FACTS
+    require(
+        path.is_file(),
+        f"{key}: {source.name} has no {FACTS}. `mme-vla record` writes it with a dataset.",
+    )
+    try:
+        table = pd.read_csv(path, usecols=["episode", "from", "to"], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise UserError(f"{key}: {path} is no table of facts: {brief(error)}.") from None
+    begins = np.zeros(source.lengths.sum(), np.float32)
+    is_visible = np.zeros_like(begins)
+    starts = np.cumsum(source.lengths) - source.lengths
+    for line, (episode, first, last) in enumerate(table.itertuples(index=False), start=2):
+        require(
+            0 <= episode < len(source.lengths) and 0 <= first <= last < source.lengths[episode],
+            f"{key}: line {line} of {path} has a fact at frames {first} to {last} of episode"
+            f" {episode}, which {source.name} does not have. Record the dataset again.",
+        )
+        begins[starts[episode] + first] += 1
+        is_visible[starts[episode] + first : starts[episode] + last + 1] = 1
+    return begins, is_visible
 
 
 def _check(source: EpisodeSource, name: str, key: str, wrong: np.ndarray, problem: str) -> None:

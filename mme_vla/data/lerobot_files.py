@@ -27,6 +27,8 @@ from mme_vla.utils.validation import validated
 
 SIDE_FILE = "meta/robomme_episodes.json"
 """What LeRobot's columns have no place for: task, seed, difficulty, options of a choice."""
+FACTS = "meta/facts.csv"
+"""The table of what its frames show, a row a fact: `record` writes it (`envs/facts.py`)."""
 RENDERED_SUFFIX = "_drawn"
 """After a camera's name: the column that says which frames it was rendered at, where not at all."""
 NAMES: Mapping[str, Mapping[str, str]] = {

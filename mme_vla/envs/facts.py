@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 KEY_POSE = 16
 """Frames after the end of a sub-task in which its result is visible, before the arm has left."""
-FACTS = "meta/facts.csv"
-"""The table of facts of a dataset."""
 COLUMNS = ("episode", "task", "fact", "value", "from", "to", "needed", "changed")
 """Of the table beside a recording."""
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from mme_vla import UserError
-from mme_vla.data.columns import label_column
+from mme_vla.data.columns import BOUNDARY, SUBTASK, label_column
 from mme_vla.data.sources import open_sources
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.extensions.anchors import Anchors
 from mme_vla.memory.extensions.events import Events, peaks
-from mme_vla.memory.extensions.keyframes import LABEL, Keyframes, write_loss
+from mme_vla.memory.extensions.keyframes import Keyframes, write_loss
 from mme_vla.memory.extensions.pyramid import Pyramid
 from mme_vla.memory.history import CachedHistory, FrameScores
 from mme_vla.types import Labels
@@ -96,7 +96,7 @@ def boundaries_batch(memory: Keyframes, rng: np.random.Generator):
         tokens = (appearances[subtask][:, None] + 0.1 * torch.randn(40, 16, D)).numpy()
         item = memory.gather_selection(CachedHistory(memory.storage, tokens, np.arange(40), 40), 39)
         item.labels = Labels(
-            {LABEL: torch.from_numpy(np.repeat(subtask, 16).astype(np.float32) + 1)}
+            {"subtask_index": torch.from_numpy(np.repeat(subtask, 16).astype(np.float32) + 1)}
         )
         items.append(item)
         begins.append(np.diff(subtask, prepend=0) > 0)
@@ -136,7 +136,7 @@ def test_the_write_loss_weighs_keyframes_like_all_other_frames() -> None:
 
 def test_the_label_of_sub_tasks_counts_them_from_one_in_every_episode() -> None:
     (source,) = open_sources(["sample"])
-    number, begins = (label_column(source, name, "labels") for name in (LABEL, "subtask_boundary"))
+    number, begins = (label_column(source, name, "labels") for name in (SUBTASK, BOUNDARY))
     first = np.cumsum(source.lengths) - source.lengths
     assert (number[first] == 1).all()
     inside = np.setdiff1d(np.arange(len(number)), first)

@@ -15,10 +15,11 @@ import torch
 
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.data.columns import BOUNDARY, label_column
+from mme_vla.data.columns import BOUNDARY, FACT, FACT_VISIBLE, SUBTASK, label_column
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.data.lerobot_files import FACTS, SAMPLE
+from mme_vla.envs.facts import Fact, write_facts
 from mme_vla.memory.base import stack_history
 from mme_vla.testing.small import open_gates, random_batch, small_policy, unit_stats
 from mme_vla.training.data import prepare_data
@@ -169,6 +170,72 @@ def test_joined_memories_read_labels_and_return_losses(policy: MMEPolicy) -> Non
     assert "losses/write_head/write" in loss_of(joined.train(), labelled(joined))[1]
 
 
+def sample_with(folder: Path, *facts: tuple[int, Fact]) -> Path:
+    """A copy of the sample with facts of episodes."""
+    root = folder / "sample"
+    shutil.copytree(SAMPLE, root)
+    (root / "SHA256SUMS").unlink(missing_ok=True)
+    write_facts(root / FACTS, [(episode, "a task", [fact]) for episode, fact in facts])
+    return root
+
+
+def test_labels_of_facts_count_them_in_their_episode_and_mark_their_frames(tmp_path: Path) -> None:
+    facts = [
+        (0, Fact("light 1", "red", (0, 3), (40,))),
+        (1, Fact("light 2", "blue", (20, 30), (40,))),
+        (1, Fact("light 1", "red", (8, 12), (40,), changed=20)),
+    ]
+    source = EpisodeSource(sample_with(tmp_path, *facts))
+    count = label_column(source, FACT, "labels")
+    is_visible = label_column(source, FACT_VISIBLE, "labels")
+    first, second, rest = np.split(count, np.cumsum(source.lengths[:2]))
+    assert set(first) == {1} and not rest.any()
+    frames = np.arange(len(second))
+    assert second.tolist() == ((frames >= 8).astype(int) + (frames >= 20)).tolist()
+    shown = np.split(is_visible, np.cumsum(source.lengths[:2]))
+    assert [np.flatnonzero(part).tolist() for part in shown] == [
+        [0, 1, 2, 3],
+        [*range(8, 13), *range(20, 31)],
+        [],
+    ]
+
+
+def test_keyframes_learn_from_facts(tmp_path: Path) -> None:
+    fact = Fact("light", "red", (20, 30), (40,))
+    root = sample_with(tmp_path, (0, fact))
+    policy = small_policy("keyframes_modul", memory={"label": FACT, "budget": 64})
+    dataset = prepared(policy, tmp_path, sources=[str(root)])
+    item = dataset[100]
+    assert item["place"][:2] == (0, 0)
+    frames = item["history"].positions[:, 0]
+    assert torch.equal(item["history"].labels[FACT], (frames >= 20).float() * item["history"].mask)
+    batch = policy.require_processor().collate([item])
+    noise = policy.training_noise(1, torch.Generator().manual_seed(0))
+    assert policy.train()(batch, noise)[1]["losses/write"] > 0
+
+
+@pytest.mark.parametrize(
+    ("table", "problem"),
+    [
+        (None, r"sample has no meta/facts.csv. `mme-vla record` writes it"),
+        ("episode,from\n0,1\n", "is no table of facts"),
+        ("episode,from,to\n0,first,2\n", "is no table of facts"),
+        ("episode,from,to\n0,1,2\n99,1,2\n", "line 3 of .* frames 1 to 2 of episode 99, which"),
+        ("episode,from,to\n0,1,9999\n", "line 2 of .* frames 1 to 9999 of episode 0, which"),
+        ("episode,from,to\n0,2,1\n", "line 2 of .* frames 2 to 1 of episode 0, which"),
+    ],
+)
+def test_facts_that_contradict_the_dataset_are_reported(
+    table: str | None, problem: str, tmp_path: Path
+) -> None:
+    root = sample_with(tmp_path)
+    (root / FACTS).unlink()
+    if table is not None:
+        (root / FACTS).write_text(table)
+    with pytest.raises(UserError, match=f"The policy's labels: .*{problem}"):
+        label_column(EpisodeSource(root), FACT, "The policy's labels")
+
+
 CASES: list[tuple[str, Callable[[np.ndarray], pa.Array], str]] = [
     (
         "missing",
@@ -216,12 +283,16 @@ def test_an_absent_column_is_reported() -> None:
 
 
 def test_the_start_of_a_sub_task_names_the_column_that_it_needs(tmp_path: Path) -> None:
-    root = tmp_path / "sample"
-    shutil.copytree(SAMPLE, root)
-    (root / "SHA256SUMS").unlink(missing_ok=True)
+    root = sample_with(tmp_path)
     pq.write_table(pq.read_table(root / TABLE).drop_columns(["simple_subgoal"]), root / TABLE)
     info = json.loads((root / "meta" / "info.json").read_text())
     del info["features"]["simple_subgoal"]
     (root / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(UserError, match=rf"\(the label {BOUNDARY}\) 'simple_subgoal'"):
+    with pytest.raises(
+        UserError, match=rf"\(the label {SUBTASK}\) 'simple_subgoal'.*memory.label=fact_index"
+    ):
+        label_column(EpisodeSource(root), SUBTASK, "The policy's labels")
+    (root / FACTS).unlink()
+    with pytest.raises(UserError, match=rf"\(the label {BOUNDARY}\) 'simple_subgoal'") as caught:
         label_column(EpisodeSource(root), BOUNDARY, "The policy's labels")
+    assert FACT not in str(caught.value)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.backbone.siglip import pool_grid
-from mme_vla.data.columns import BOUNDARY, SUBTASK, with_labels
+from mme_vla.data.columns import BOUNDARY, FACT, FACT_VISIBLE, SUBTASK, with_labels
 from mme_vla.embodiment.action_space import MIDDLE, ActionSpace
 from mme_vla.errors import require
 from mme_vla.extras.nano.backbone import NanoBackbone
@@ -463,12 +463,21 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
 
 
 def _labels(memory: Memory, demonstration: Demonstration) -> FrameLabels:
-    """The labels of sub-tasks that a memory reads."""
+    """The labels of sub-tasks and facts that a memory reads."""
+
+    def count(begins: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda frames: np.searchsorted(begins, frames, side="right").astype(np.float32)
+
+    def is_in(marked: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda frames: np.isin(frames, marked).astype(np.float32)
+
     begins = demonstration.boundaries
-    known: FrameLabels = {
-        SUBTASK: lambda frames: np.searchsorted(begins, frames, side="right").astype(np.float32),
-        BOUNDARY: lambda frames: np.isin(frames, begins).astype(np.float32),
-    }
+    known = {SUBTASK: count(begins), BOUNDARY: is_in(begins)}
+    if demonstration.facts is not None:
+        spans = [fact.frames for fact in demonstration.facts]
+        shown = [np.arange(first, last + 1) for first, last in spans]
+        known[FACT] = count(np.sort([first for first, _ in spans]))
+        known[FACT_VISIBLE] = is_in(np.concatenate([np.empty(0, np.int64), *shown]))
     return {name: known[name] for name in labels_read(memory) if name in known}
 
 

@@ -4,8 +4,8 @@ whole (EventVLA).
 After EventVLA, whose head predicts keyframes from the hidden state of an action chunk, keeps those
 that are certain enough beside a few anchors, and suppresses neighbours. A memory here is computed
 before the language model, so the head reads the mean of a frame's tokens and its difference from
-the stored frame before it. Its labels are the sub-tasks of the dataset: a stored frame is a
-keyframe where a sub-task has begun since the stored frame before it. Without labels the action loss
+the stored frame before it. Its labels are the sub-tasks or the facts of the dataset: a stored frame
+is a keyframe where one has begun since the stored frame before it. Without labels the action loss
 alone trains it, through a straight-through sigmoid as in `learned_topk`.
 """
 
@@ -27,7 +27,6 @@ from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens, ReadsLabels
 
-LABEL = "subtask_index"
 LARGE = 1e4  # beyond any score
 
 
@@ -36,8 +35,6 @@ class Keyframes(PerceptualMemory, ReadsLabels):
     """The first frame, the newest stored one, and `budget / grid² − 2` that the head is most
     certain of.
     """
-
-    reads_labels = (LABEL,)
 
     def __init__(
         self,
@@ -50,6 +47,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         every: int = 8,
         pool: int = 80,
         hidden: int | None = None,
+        label: str = "subtask_index",
         **encoder: Any,
     ) -> None:
         """See `PerceptualMemory`.
@@ -59,6 +57,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
             every: frames 0 and k·every − 1 can be kept.
             pool: most of them that the head reads, evenly spaced.
             hidden: width of the head; None is a quarter of `d_vision`, at least 64.
+            label: a label that changes at keyframes: `subtask_index`, `fact_index` or a column.
         """
         check_sizes("memory", every=every, pool=pool)
         frames = budget_frames(budget, grid, LEAST_FRAMES["keyframes"])
@@ -72,6 +71,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         self.capacity = pool * grid**2
         self.frames = frames
         self.pool = pool
+        self.reads_labels = (label,)
         self.read = nn.Linear(2 * d_vision, hidden)
         self.write = nn.Linear(hidden, 1)
 
@@ -105,13 +105,14 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         tokens = tokens * weight[..., None].to(tokens.dtype)
         ages = None if history.ages is None else rows_at(history.ages, indices)
         losses = {}
-        if LABEL in history.labels:
-            subtask = by_frame(history.labels[LABEL], patches)[..., 0]
-            losses["write"] = write_loss(scores, subtask, valid)
+        (name,) = self.reads_labels
+        if name in history.labels:
+            label = by_frame(history.labels[name], patches)[..., 0]
+            losses["write"] = write_loss(scores, label, valid)
         return MemoryTokens(tokens, mask, ages=ages, losses=losses)
 
     def scores(self, features: Tensor) -> Tensor:
-        """Logits [b, t] float32: whether a sub-task has begun since the frame before; features [b,
+        """Logits [b, t] float32: whether a frame is a keyframe; features [b,
         t·p, d].
         """
         with full_precision(features):
@@ -135,15 +136,15 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         return ranks.topk(self.frames, dim=1).indices.sort(1).values
 
 
-def write_loss(scores: Tensor, subtask: Tensor, valid: Tensor) -> Tensor:
+def write_loss(scores: Tensor, label: Tensor, valid: Tensor) -> Tensor:
     """Cross-entropy [b] of logits [b, t], the mean over keyframes and that over other frames
     counting alike.
 
     Args:
-        subtask: the number of each frame's sub-task, [b, t].
+        label: changes at keyframes, such as the number of each frame's sub-task, [b, t].
         valid: bool [b, t].
     """
-    begins = torch.diff(subtask, dim=1, prepend=subtask[:, :1]).ne(0)
+    begins = torch.diff(label, dim=1, prepend=label[:, :1]).ne(0)
     losses = functional.binary_cross_entropy_with_logits(
         scores, begins.to(scores.dtype), reduction="none"
     )

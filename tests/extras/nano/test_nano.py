@@ -13,6 +13,7 @@ import torch
 from helpers.nano_policies import EVERY_EIGHTH, demonstration, nano
 from mme_vla import UserError, build_policy
 from mme_vla.data.waypoints import Motions
+from mme_vla.envs.facts import Fact
 from mme_vla.extras.nano.cli import nano as nano_command
 from mme_vla.extras.nano.cli.nano import with_settings
 from mme_vla.extras.nano.demonstrations import Demonstration
@@ -97,6 +98,22 @@ def test_a_memory_learns_from_the_sub_tasks_of_demonstrations() -> None:
         "losses/write"
         in policy.train()(batch, policy.training_noise(1, torch.Generator().manual_seed(0)))[1]
     )
+
+
+def test_a_memory_learns_from_the_facts_of_demonstrations() -> None:
+    size = {"budget": 4, "grid": 1, "every": 8, "pool": 8, "label": "fact_index"}
+    policy = nano("keyframes_modul", memory=size)
+    read = policy.frames_read(np.array([66, 120, 155]), 66).tolist()
+    made = demonstration(tuple(sorted({*read, 66, 120, 155})))
+    facts = [Fact("b", "2", (60, 70)), Fact("a", "1", (10, 20))]
+    made = replace(made, facts=facts)
+    policy.require_processor().stats = statistics([made], policy)
+    batch = Decisions.of(policy, [made]).collate([2])
+    assert batch.history is not None
+    valid = batch.history.mask[0]
+    frames = batch.history.positions[0, valid, 0]
+    expected = (frames >= 10).int() + (frames >= 60).int()
+    assert batch.history.labels["fact_index"][0, valid].tolist() == expected.tolist()
 
 
 def test_a_frame_that_was_not_rendered_is_refused() -> None:

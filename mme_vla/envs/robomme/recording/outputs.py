@@ -11,9 +11,9 @@ import numpy as np
 
 from mme_vla.data.convert import ConvertOptions, convert, drop_work, planned_options
 from mme_vla.data.hdf5 import EpisodeRef, list_episodes, open_episode
-from mme_vla.data.lerobot_files import SIDE_FILE
+from mme_vla.data.lerobot_files import FACTS, SIDE_FILE
 from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.envs.facts import FACTS, Fact, write_facts
+from mme_vla.envs.facts import Fact, write_facts
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.errors import require

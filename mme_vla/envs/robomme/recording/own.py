@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.data.lerobot_files import SIDE_FILE
+from mme_vla.data.lerobot_files import FACTS, SIDE_FILE
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import choice_action
 from mme_vla.envs.base import CHOICES, OPTIONS, Environment, EpisodeEnv
-from mme_vla.envs.facts import FACTS, Fact, write_facts
+from mme_vla.envs.facts import Fact, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import UserError, counted
