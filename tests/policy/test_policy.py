@@ -179,7 +179,7 @@ def test_released_modulator_starts_near_the_memoryless_policy():
 
 def prefill(policy, batch):
     """Keys and values of the prefix, and what the memory injects."""
-    memory = policy.encode_memory(batch.history)
+    memory = policy.model.memory_tokens(batch)
     injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     transformer = policy.backbone.transformer
     layout = transformer.layout(injection.blocks, injection.visibility)
@@ -216,7 +216,7 @@ def test_prompt_sees_memory_only_if_requested(integration):
 def test_budget_is_a_number_in_the_config(memory, budget):
     policy = small_policy(f"{memory}_context", backbone=FEW_TOKENS, memory={"budget": budget})
     batch = random_batch(policy, batch=1, valid=64)
-    tokens = policy.encode_memory(batch.history)
+    tokens = policy.model.memory_tokens(batch)
     assert tokens.tokens.shape[1] == tokens.mask.shape[1] == budget
     assert velocity(policy, batch).isfinite().all()
 
