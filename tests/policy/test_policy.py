@@ -183,7 +183,8 @@ def prefill(policy, batch):
     injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     transformer = policy.backbone.transformer
     layout = transformer.layout(injection.blocks, injection.visibility)
-    _, prefix = transformer(injection.blocks, layout, keep=True)
+    space = transformer.cache_space(injection.blocks, policy.horizon)
+    _, prefix = transformer(injection.blocks, layout, past=space, keep=True)
     return prefix, injection
 
 
@@ -192,7 +193,7 @@ def prefix_keys(policy, batch):
     """Last-layer keys of the valid image and prompt tokens."""
     prefix, _ = prefill(policy, batch)
     after_memory = slice(policy.memory.budget, None)
-    return prefix.layers[-1][0][:, after_memory][prefix.mask[:, after_memory]]
+    return prefix.layers[-1].past()[0][:, after_memory][prefix.mask[:, after_memory]]
 
 
 @pytest.mark.parametrize("integration", ["context", "expert"])

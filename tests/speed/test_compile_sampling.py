@@ -3,6 +3,8 @@ weights alone is kept.
 """
 
 import logging
+from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -20,6 +22,16 @@ from mme_vla.types import Batch
 MODELS = ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context", "rmt_context"]
 
 
+class JoinedKV(NamedTuple):
+    """The past's keys and values of one layer, behind which no space is left."""
+
+    k: Tensor
+    v: Tensor
+
+    def filled(self, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.cat([self.k, k], 1), torch.cat([self.v, v], 1)
+
+
 @torch.no_grad()
 def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> Tensor:
     """Sampling by the parts: every step puts its keys behind the prefix's in a new tensor."""
@@ -27,7 +39,9 @@ def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> T
     memory = policy.model.memory_tokens(batch)
     injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     before = backbone.transformer.layout(injection.blocks, injection.visibility)
-    _, prefix = backbone.transformer(injection.blocks, before, keep=True)
+    space = backbone.transformer.cache_space(injection.blocks, 0)
+    _, prefix = backbone.transformer(injection.blocks, before, past=space, keep=True)
+    prefix = replace(prefix, layers=[JoinedKV(*layer.past()) for layer in prefix.layers])
     layout = backbone.transformer.layout(
         [backbone.action_block(noise)], injection.visibility, prefix
     )
