@@ -393,7 +393,7 @@ class OnlineHistory(History):
 
 
 class DerivedHistory(History):
-    """A history of the same frames as another one, its `source`. A subclass changes their tokens."""
+    """A history of the same frames as its `source`. A subclass changes their tokens."""
 
     def __init__(self, source: History) -> None:
         super().__init__(source.spec, source.exec_start)
