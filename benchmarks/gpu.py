@@ -77,7 +77,7 @@ def sampler_of(model: str, setup: Setup) -> tuple[MMEPolicy, Callable[[], Tensor
     batch = replace(batch_of(policy, 1, device), actions=None)
     noise = draws_of(policy, 1, device)["noise"]
     with torch.no_grad(), policy.autocast():
-        memory = policy.encode_memory(batch.history)
+        memory = policy.model.memory_tokens(batch)
     return policy, partial(policy.sample_actions, batch, noise, memory=memory)
 
 

@@ -55,7 +55,7 @@ def kernels_of_chunk(policy: MMEPolicy, steps: int = 10) -> dict[str, int]:
     batch = batch_of(policy, 1)
     noise = named_noise(torch.zeros(1, policy.horizon, policy.action_dim, device=DEVICE))
     with policy.autocast():
-        memory = policy.encode_memory(batch.history)
+        memory = policy.model.memory_tokens(batch)
     batch = replace(batch, history=None, actions=None)
     policy.model.sample(batch, noise, steps, memory)
     before = counted()

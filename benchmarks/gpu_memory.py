@@ -76,7 +76,7 @@ def chunk(model: str, backbone: str = "pi05") -> dict[str, float]:
         torch.zeros(1, policy.horizon, policy.action_dim, device=DEVICE),
     )
     with torch.no_grad(), policy.autocast():
-        memory = policy.encode_memory(batch.history)
+        memory = policy.model.memory_tokens(batch)
     # an episode's tokens are counted where episodes are
     batch = replace(batch, history=None, actions=None)
     gc.collect()  # a policy and its model refer to each other

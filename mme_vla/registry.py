@@ -338,7 +338,6 @@ HEADS: Registry[Any] = Registry(
     {
         "flow": "mme_vla.backbone.flow",
         "clean_flow": "mme_vla.backbone.flow",
-        "choice": "mme_vla.backbone.choice",
     },
     key="head",
 )

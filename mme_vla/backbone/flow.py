@@ -5,7 +5,6 @@
 
 import math
 from collections.abc import Callable, Mapping
-from itertools import pairwise
 from typing import Any, ClassVar
 
 import torch
@@ -64,15 +63,6 @@ def euler_times(steps: int, device: torch.device) -> Tensor:
         times.append(time)
         time = time - 1.0 / steps
     return torch.stack(times)
-
-
-def normal_log_density(x: Tensor, deviation: float) -> Tensor:
-    """Log-density [b] of x [b, …] under independent normal distributions of this standard
-    deviation.
-    """
-    x = x.flatten(1)
-    normaliser = math.log(deviation) + 0.5 * math.log(2 * math.pi)
-    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * normaliser
 
 
 Predict = Callable[[Tensor, Tensor], Tensor]
@@ -187,45 +177,6 @@ class FlowHead:
         """
         x = x - velocity.to(x.dtype) / steps
         return x if noise is None else x + noise
-
-    # Gaussian steps, whose density is known
-
-    def sample_path(
-        self, predict: PredictAt, noise: Tensor, increments: Tensor, deviation: float
-    ) -> Tensor:
-        """Every state x_0 … x_k [b, k + 1, h, a] of k Euler steps with noise: x_{i+1} = x_i −
-        v(x_i)/k + σ·ε_i.
-
-        Args:
-            noise: x_0 [b, h, a].
-            increments: ε [b, k, h, a], standard normal.
-            deviation: σ; 0 gives plain Euler steps.
-        """
-        steps = increments.shape[1]
-        times = self.times(steps, noise.device)
-        velocity = self.velocity(predict, times, {"noise": noise})
-        states = [noise]
-        for index, increment in enumerate(increments.unbind(1)):
-            v = velocity(states[-1], index)
-            scaled = deviation * increment if deviation else None
-            states.append(self.step(states[-1], v, steps, scaled))
-        return torch.stack(states, 1)
-
-    def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:
-        """Log-density [b] of the states [b, k + 1, h, a] that `sample_path` made: log N(x_0) + Σ
-        log N(x_{i+1} | x_i).
-
-        Gradients reach the network's parameters, and not the states.
-        """
-        steps = path.shape[1] - 1
-        states = path.detach().unbind(1)
-        times = self.times(steps, path.device)
-        velocity = self.velocity(predict, times, {"noise": states[0]})
-        log_prob = normal_log_density(states[0], 1.0)
-        for index, (state, reached) in enumerate(pairwise(states)):
-            error = reached - state + velocity(state, index).to(path.dtype) / steps
-            log_prob = log_prob + normal_log_density(error, deviation)
-        return log_prob
 
 
 @HEADS.register("clean_flow")

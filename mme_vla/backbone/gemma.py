@@ -224,8 +224,8 @@ class JointBlock(nn.Module):
         mask: AttentionMask,
         condition: Tensor | LayerTimeModulation | None,
         hook: Callable[[Tensor], Tensor] | None = None,
-        past: KeyValue | StaticKV | None = None,
-    ) -> tuple[list[Segment], KeyValue]:
+        past: StaticKV | None = None,
+    ) -> list[Segment]:
         """Run one layer.
 
         Args:
@@ -235,12 +235,11 @@ class JointBlock(nn.Module):
             condition: what the action expert's norms are conditioned on: the time embedding [b, c]
                 or a modulation.
             hook: see `Hook`, layer already bound.
-            past: keys and values [b, past, K, h] of earlier passes, rotated; or these with space
-                for this pass's own.
+            past: keys and values [b, past, K, h] of earlier passes, rotated, with space for this
+                pass's own.
 
         Returns:
-            The updated segments (of those that have queries), and this pass's keys (rotated) and
-            values.
+            The updated segments, of those that have queries.
         """
         # While compiled layers sample, the sum that ends a layer is deferred: the next one adds it
         # in one kernel with its first norm. All segments of the pass then come with an update.
@@ -272,12 +271,13 @@ class JointBlock(nn.Module):
         # All queries read all keys, those of earlier passes first.
         k, v = _join(keys), _join(values)
         # A cache is filled even where nothing reads it yet.
-        all_k, all_v = _append_to_past(past, k, v)
+        if past is not None:
+            k, v = past.filled(k, v)
         if not querying:
-            return [], (k, v)
+            return []
         if len(querying) < len(segments):
             mask = select_rows(mask, [each.rows for each in querying], k.dtype)
-        attended = attend(_join(queries), all_k, all_v, mask)
+        attended = attend(_join(queries), k, v, mask)
 
         # Every expert continues with its own tokens. Only the action expert has a hook.
         lengths = [each.rows.stop - each.rows.start for each in querying]
@@ -291,7 +291,7 @@ class JointBlock(nn.Module):
             if not defers_sum:
                 following = Segment(each.expert, following.summed())
             updated.append(following)
-        return updated, (k, v)
+        return updated
 
 
 class Layout(NamedTuple):
@@ -313,7 +313,7 @@ class KVCache:
     are valid.
     """
 
-    layers: Sequence[KeyValue | StaticKV]
+    layers: Sequence[StaticKV]
     spans: list[Span]
     mask: Tensor  # [b, past] bool
 
@@ -406,8 +406,8 @@ class JointTransformer(nn.Module):
             condition: time condition [b, c] of the action expert, or its modulations; unread
                 without that expert.
             hook: the per-layer hook.
-            past: an earlier pass's cache.
-            keep: whether to return a cache of `past` and this pass.
+            past: an earlier pass's cache, or `cache_space`.
+            keep: whether to return a cache of `past` and this pass; `past` must be given.
 
         Returns:
             The output [b, n, d] of the action expert's last block (None if it is not among
@@ -423,33 +423,28 @@ class JointTransformer(nn.Module):
                     gate = condition.final.gate  # of any value; this is no other input of the layer
                 zeros = torch.zeros_like(segment.tokens)
                 segments[i] = segment._replace(update=zeros, gate=gate)
-        cached: list[KeyValue | StaticKV] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, TimeModulations) else condition
-            past_kv = None if past is None else past.layers[i]
-            segments, (k, v) = run_layer(
+            segments = run_layer(
                 block,
                 segments,
                 layout.rope,
                 layout.mask,
                 of_layer,
                 bind_hook(hook, i),
-                past_kv,
+                None if past is None else past.layers[i],
                 how=self.gradient_checkpointing,
             )
-            if keep and isinstance(past_kv, StaticKV):
-                cached.append(past_kv._replace(start=past_kv.start + k.shape[1]))
-            elif keep:
-                # Copies where they are views: a view would keep all queries of its layer alive.
-                k, v = _append_to_past(past_kv, k, v)
-                cached.append((k.contiguous(), v.contiguous()))
         output = None
         if segments:
             final = condition.final if isinstance(condition, TimeModulations) else condition
             output = self.read_out(self.final_norm, segments[-1], final)
         if not keep:
             return output, None
-        return output, KVCache(cached, layout.spans, layout.valid)
+        assert past is not None, "keep=True needs a past with space: see cache_space()."
+        tokens = sum(len(block) for block in blocks)
+        layers = [layer._replace(start=layer.start + tokens) for layer in past.layers]
+        return output, KVCache(layers, layout.spans, layout.valid)
 
     # Sampling
 
@@ -490,15 +485,6 @@ def read_out(norm: AdaRMSNorm, segment: Segment, condition: Tensor | Modulation)
     """The output [b, n, d] of the last layer behind the final norm."""
     output, _ = norm(segment.summed(), condition)
     return output
-
-
-def _append_to_past(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:
-    """Keys and values of a pass behind those of the past; a `StaticKV` keeps them."""
-    if past is None:
-        return k, v
-    if isinstance(past, StaticKV):
-        return past.filled(k, v)
-    return torch.cat([past[0], k], 1), torch.cat([past[1], v], 1)
 
 
 def _join(parts: list[Tensor]) -> Tensor:

@@ -392,15 +392,12 @@ class OnlineHistory(History):
         return self._tokens[rows, patches]
 
 
-class PromptConditionedHistory(History):
-    """A history whose tokens are changed as they are gathered, by `with_prompt`
-    (`MMEModel.prompt_condition`, of a batch of one).
-    """
+class DerivedHistory(History):
+    """A history of the same frames as its `source`. A subclass changes their tokens."""
 
-    def __init__(self, source: History, with_prompt: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, source: History) -> None:
         super().__init__(source.spec, source.exec_start)
         self._source = source
-        self._with_prompt = with_prompt
         self.motion = source.motion
         self.state_width = source.state_width
         self.clock_starts = source.clock_starts
@@ -415,6 +412,16 @@ class PromptConditionedHistory(History):
     @property
     def stored_frames(self) -> np.ndarray:
         return self._source.stored_frames
+
+
+class PromptConditionedHistory(DerivedHistory):
+    """A history whose tokens are changed as they are gathered, by `with_prompt`
+    (`MMEModel.prompt_condition`, of a batch of one).
+    """
+
+    def __init__(self, source: History, with_prompt: Callable[[Tensor], Tensor]) -> None:
+        super().__init__(source)
+        self._with_prompt = with_prompt
 
     def gather(self, indices: np.ndarray) -> Tensor:
         return self._with_prompt(self._source.gather(indices)[None])[0]

@@ -16,7 +16,7 @@ from mme_vla.memory.base import (
     pad_selection,
     union_frames,
 )
-from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
+from mme_vla.memory.history import DerivedHistory, FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens, ReadsLabels, labels_read
 
@@ -200,18 +200,12 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         return MemoryTokens(tokens, mask, metrics, ages, losses)
 
 
-class CoarserHistory(History):
+class CoarserHistory(DerivedHistory):
     """A history as a member reads it that needs a coarser grid than is stored."""
 
     def __init__(self, source: History, spec: StorageSpec) -> None:
-        super().__init__(spec, source.exec_start)
-        self._source = source
-        self.motion = source.motion
-        self.state_width = source.state_width
-        self.clock_starts = source.clock_starts
-
-    def __len__(self) -> int:
-        return len(self._source)
+        super().__init__(source)
+        self.spec = spec
 
     @property
     def scores(self) -> FrameScores:
@@ -220,10 +214,6 @@ class CoarserHistory(History):
         every = fine // grid
         rows = scores.values.reshape(-1, fine, fine)[:, ::every, ::every]
         return FrameScores(scores.frames, rows.reshape(-1, grid**2))
-
-    @property
-    def stored_frames(self) -> np.ndarray:
-        return self._source.stored_frames
 
     def gather(self, indices: np.ndarray) -> Tensor:
         return self._pooled(indices, self._source.gather)

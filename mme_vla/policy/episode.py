@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.embodiment import Embodiment, Option
+from mme_vla.embodiment import Option
 from mme_vla.errors import UserError, require
 from mme_vla.memory.history import History, LazyHistory, OnlineHistory
 from mme_vla.processing.base import motion_rows
@@ -19,7 +19,6 @@ from mme_vla.speed.rtc import overlap_weights
 from mme_vla.types import FrameBatch, HistoryTokens, Overlap, PastViews
 
 if TYPE_CHECKING:
-    from mme_vla.memory.base import MemoryModule
     from mme_vla.policy.base import Policy
     from mme_vla.processing.base import PolicyProcessor
 
@@ -45,28 +44,10 @@ class Failure:
     again: bool
 
 
-class Host(Protocol):
-    """What an episode needs of its policy."""
-
-    @property
-    def memory(self) -> "MemoryModule | None": ...
-
-    @property
-    def embodiment(self) -> Embodiment: ...
-
-    def require_processor(self) -> "PolicyProcessor": ...
-
-    def require_memory(self) -> "MemoryModule": ...
-
-    def encode_frames(self, frames: np.ndarray) -> Tensor: ...
-
-    def sampling_noise(self, generator: torch.Generator) -> dict[str, Tensor]: ...
-
-
 class Episode:
     """State of one episode: goal, current view and robot state, history of past frames, noise."""
 
-    def __init__(self, policy: Host, goal: str, seed: int = 0) -> None:
+    def __init__(self, policy: "Policy", goal: str, seed: int = 0) -> None:
         self._policy = policy
         self._robot = policy.embodiment
         self._generator = torch.Generator().manual_seed(seed)

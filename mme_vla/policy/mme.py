@@ -46,7 +46,6 @@ from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import (
     Batch,
-    HistoryTokens,
     MemoryTokens,
     Noise,
     map_noise,
@@ -413,20 +412,6 @@ class MMEPolicy(NetworkPolicy):
         memory = self.encode_memories(episodes, batch)
         return self.sample_actions(batch, noise, steps, memory=memory)
 
-    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """As in `NetworkPolicy`, for backbones that read stored tokens without the prompt.
-
-        Raises:
-            UserError: the backbone needs the prompt, as `MMEModel.memory_tokens` gives it.
-        """
-        reads_prompt = type(self.backbone).condition_on_prompt is not Backbone.condition_on_prompt
-        if history is not None and reads_prompt:
-            raise UserError(
-                f"encode_memory: {type(self.backbone).__name__} reads stored tokens with the"
-                " prompt. Call policy.model.memory_tokens(batch)."
-            )
-        return super().encode_memory(history)
-
     @torch.no_grad()
     def encode_memories(
         self, episodes: Sequence[Episode], batch: Batch | None = None
@@ -449,13 +434,6 @@ class MMEPolicy(NetworkPolicy):
                 episode.read = history
                 histories.append(history)
             return self.memory.encode(histories, [episode.stream for episode in episodes])
-
-    @torch.no_grad()
-    def prepare(self, episode: Episode) -> bool:
-        if self.memory is None or episode.read is None:
-            return False
-        with self.autocast():
-            return self.memory.prepare(episode.read, episode.stream)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
         """What the memory reads; nothing without one."""

@@ -11,25 +11,15 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers import autocast
-from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.speed import Recomputes
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import MemoryTokens
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
-
-
-def processor_for[P](kind: type[P], processor: object, names: str) -> P | None:
-    """The processor, which must be of the kind that a policy needs; `names` are those of its
-    configurations.
-    """
-    if processor is None or isinstance(processor, kind):
-        return processor
-    raise UserError(f"This policy needs its own processor: set processor={names}.")
 
 
 class MemoryTower(NamedTuple):
@@ -96,33 +86,25 @@ class NetworkPolicy(Policy, Recomputes):
         """The tower of the stored vision tokens."""
         raise NotImplementedError
 
-    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """Encode selections into memory tokens; None without memory or selections.
-
-        For the losses of prior methods. A policy with an `MMEModel` has `MMEModel.memory_tokens`.
-        """
-        if self.memory is None or history is None:
-            return None
-        with self.autocast():
-            return self.memory(history)
-
     @torch.no_grad()
     def encode_memories(self, episodes: Sequence[Episode]) -> MemoryTokens | None:
         """Encode the histories of running episodes, with their streams; None without memory."""
         if self.memory is None:
             return None
-        histories = [episode.required_history() for episode in episodes]
-        streams = [episode.stream for episode in episodes]
+        histories = []
+        for episode in episodes:
+            episode.read = episode.required_history()
+            histories.append(episode.read)
         with self.autocast():
-            return self.memory.encode(histories, streams)
+            return self.memory.encode(histories, [episode.stream for episode in episodes])
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
         """Read a piece of what the next memory tokens need; return whether more remain."""
-        if self.memory is None or not episode.n_observed_frames:
+        if self.memory is None or episode.read is None:
             return False
         with self.autocast():
-            return self.memory.prepare(episode.required_history(), episode.stream)
+            return self.memory.prepare(episode.read, episode.stream)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """Frames that the memory reads; without memory, any."""

@@ -48,9 +48,11 @@ def test_euler_steps_of_the_true_velocity_end_at_the_actions(steps):
     times = flow.euler_times(steps, CPU)
     assert len(times) == steps and times[0] == 1 and times[-1] == pytest.approx(1 / steps, abs=1e-5)
     head = flow.FlowHead(horizon=3, action_dim=4)
-    none = torch.zeros(2, steps, 3, 4)
-    path = head.sample_path(lambda x, i: noise - actions, noise, none, deviation=0.0)
-    assert torch.allclose(path[:, -1], actions, atol=1e-5)
+    velocity = head.velocity(lambda x, i: noise - actions, times, {"noise": noise})
+    x = head.start({"noise": noise}, steps, None)
+    for index in range(steps):
+        x = head.step(x, velocity(x, index), steps)
+    assert torch.allclose(x, actions, atol=1e-5)
 
 
 def test_max_pooling_reaches_the_stored_tokens():

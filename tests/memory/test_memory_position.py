@@ -67,7 +67,7 @@ def test_a_dropped_frame_shifts_the_distance_the_older_ones_stand_from_the_view_
 
     def distance(selection: HistoryTokens) -> float:
         """From the first memory token to the first token of the current view."""
-        memory = policy.encode_memory(selection)
+        memory = policy.memory(selection)
         assert memory is not None
         observed = policy.backbone.embed(replace(views, images=views.images.float()))
         blocks = policy.integration.blocks(observed, memory)
@@ -88,8 +88,8 @@ def test_a_frame_that_is_not_there_moves_the_remainder_of_what_the_modulator_rea
     position: str, shifts: bool
 ) -> None:
     policy = composed("modul", position)
-    memory = policy.encode_memory(remembered(policy))
-    fewer = policy.encode_memory(without(remembered(policy), OLD, OLD))
+    memory = policy.memory(remembered(policy))
+    fewer = policy.memory(without(remembered(policy), OLD, OLD))
     assert memory is not None and fewer is not None
     hidden = replace(memory, mask=memory.mask.clone())
     hidden.mask[:, OLD : 2 * OLD] = (
@@ -110,7 +110,7 @@ def test_time_is_counted_back_from_now(integration: str) -> None:
     policy = composed(integration, "time")
     batch = random_batch(policy, valid=32)
     assert batch.history is not None and batch.history.step is not None
-    memory = policy.encode_memory(batch.history)
+    memory = policy.model.memory_tokens(batch)
     assert memory is not None and memory.ages is not None
     later = replace(
         batch.history, positions=batch.history.positions.clone(), step=batch.history.step + 700

@@ -145,7 +145,7 @@ def test_memory_tokens_of_episodes_are_read_with_their_prompts(
     frames = moving_frames(3, size=policy.backbone.image_size)
     episode.observe({"front": frames, "wrist": frames}, np.zeros((3, 8), np.float32))
     before = policy.encode_memories([episode])
-    assert torch.equal(before.tokens, policy.encode_memory(selection_of(policy, episode)).tokens)
+    assert torch.equal(before.tokens, policy.memory(selection_of(policy, episode)).tokens)
 
     def with_prompt(
         self: Any, tokens: torch.Tensor, prompt: torch.Tensor, prompt_mask: torch.Tensor
@@ -159,8 +159,6 @@ def test_memory_tokens_of_episodes_are_read_with_their_prompts(
     tokens = policy.encode_memories([episode]).tokens[valid]
     assert torch.equal(tokens, policy.model.memory_tokens(batch).tokens[valid])
     assert not torch.equal(tokens, before.tokens[valid])
-    with pytest.raises(UserError, match=r"policy\.model\.memory_tokens"):
-        policy.encode_memory(batch.history)
 
 
 def selection_of(policy: MMEPolicy, episode: Any) -> Any:

@@ -179,11 +179,12 @@ def test_released_modulator_starts_near_the_memoryless_policy():
 
 def prefill(policy, batch):
     """Keys and values of the prefix, and what the memory injects."""
-    memory = policy.encode_memory(batch.history)
+    memory = policy.model.memory_tokens(batch)
     injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     transformer = policy.backbone.transformer
     layout = transformer.layout(injection.blocks, injection.visibility)
-    _, prefix = transformer(injection.blocks, layout, keep=True)
+    space = transformer.cache_space(injection.blocks, policy.horizon)
+    _, prefix = transformer(injection.blocks, layout, past=space, keep=True)
     return prefix, injection
 
 
@@ -192,7 +193,7 @@ def prefix_keys(policy, batch):
     """Last-layer keys of the valid image and prompt tokens."""
     prefix, _ = prefill(policy, batch)
     after_memory = slice(policy.memory.budget, None)
-    return prefix.layers[-1][0][:, after_memory][prefix.mask[:, after_memory]]
+    return prefix.layers[-1].past()[0][:, after_memory][prefix.mask[:, after_memory]]
 
 
 @pytest.mark.parametrize("integration", ["context", "expert"])
@@ -216,7 +217,7 @@ def test_prompt_sees_memory_only_if_requested(integration):
 def test_budget_is_a_number_in_the_config(memory, budget):
     policy = small_policy(f"{memory}_context", backbone=FEW_TOKENS, memory={"budget": budget})
     batch = random_batch(policy, batch=1, valid=64)
-    tokens = policy.encode_memory(batch.history)
+    tokens = policy.model.memory_tokens(batch)
     assert tokens.tokens.shape[1] == tokens.mask.shape[1] == budget
     assert velocity(policy, batch).isfinite().all()
 

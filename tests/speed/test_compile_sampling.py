@@ -3,6 +3,8 @@ weights alone is kept.
 """
 
 import logging
+from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -13,11 +15,21 @@ from mme_vla.backbone import flow
 from mme_vla.cli.loading import prepare_sampling
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.speed import graphs
-from mme_vla.speed.graphs import CapturedSampling, GraphSampler
+from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.types import Batch
 
 MODELS = ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context", "rmt_context"]
+
+
+class JoinedKV(NamedTuple):
+    """The past's keys and values of one layer, behind which no space is left."""
+
+    k: Tensor
+    v: Tensor
+
+    def filled(self, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.cat([self.k, k], 1), torch.cat([self.v, v], 1)
 
 
 @torch.no_grad()
@@ -27,7 +39,9 @@ def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> T
     memory = policy.model.memory_tokens(batch)
     injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     before = backbone.transformer.layout(injection.blocks, injection.visibility)
-    _, prefix = backbone.transformer(injection.blocks, before, keep=True)
+    space = backbone.transformer.cache_space(injection.blocks, 0)
+    _, prefix = backbone.transformer(injection.blocks, before, past=space, keep=True)
+    prefix = replace(prefix, layers=[JoinedKV(*layer.past()) for layer in prefix.layers])
     layout = backbone.transformer.layout(
         [backbone.action_block(noise)], injection.visibility, prefix
     )
@@ -88,12 +102,12 @@ def test_time_modulations_are_computed_once_and_anew_where_a_weight_has_changed(
 class Replayed:
     """A fake CUDA graph on a CPU: runs again what was captured, on the captured inputs."""
 
-    def __init__(self, sampler: GraphSampler, inputs: graphs.Inputs) -> None:
-        self._sampler, self._inputs = sampler, inputs
-        self.chunks = sampler._run(inputs)
+    def __init__(self, sampler: CapturedSampling, inputs: graphs.Inputs, steps: int) -> None:
+        self._sampler, self._inputs, self._steps = sampler, inputs, steps
+        self.chunks = sampler._run(inputs, steps)
 
     def replay(self) -> None:
-        self.chunks.copy_(self._sampler._run(self._inputs))
+        self.chunks.copy_(self._sampler._run(self._inputs, self._steps))
 
 
 @pytest.fixture
@@ -101,12 +115,12 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Lets graphs be captured without a GPU; the sizes of the batches that were."""
     sizes: list[int] = []
 
-    def capture(self: GraphSampler, inputs: graphs.Inputs) -> graphs._Captured:
-        replayed = Replayed(self, inputs)
+    def capture(self: CapturedSampling, inputs: graphs.Inputs, steps: int) -> graphs._Captured:
+        replayed = Replayed(self, inputs, steps)
         sizes.append(len(replayed.chunks))
         return graphs._Captured(replayed, inputs, replayed.chunks)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(GraphSampler, "_capture", capture)
+    monkeypatch.setattr(CapturedSampling, "_capture", capture)
     return sizes
 
 
@@ -125,6 +139,8 @@ def test_few_sizes_are_captured_and_each_batch_gets_its_reply(
     policy._sampler = CapturedSampling(policy.model.sample, policy.backbone.compile_sampling())
     chunks = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     assert captures == [4, 1, 2]
+    policy.sample_actions(*cases[0], steps=3)
+    assert captures == [4, 1, 2, 4], "other steps are another graph"
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(chunks, expected, strict=True))
     policy.train()
     policy.sample_actions(*cases[0], steps=2)
@@ -132,7 +148,7 @@ def test_few_sizes_are_captured_and_each_batch_gets_its_reply(
     with torch.no_grad():
         policy.backbone.time_in.bias.add_(1)
     changed = policy.sample_actions(*cases[2], steps=2)
-    assert captures == [4, 1, 2, 1], "what was captured from other modulations is dropped"
+    assert captures == [4, 1, 2, 4, 1], "what was captured from other modulations is dropped"
     assert not torch.allclose(changed, chunks[2])
 
 

@@ -18,6 +18,7 @@ from mme_vla.subgoal.finetuning.rows import (
     Collator,
     RowDataset,
     RowOptions,
+    TrainingRow,
     hf_dataset,
     question_of,
     read_rows,
@@ -69,10 +70,13 @@ def losses(output):
 
 
 def test_points_of_a_row_go_to_the_question_first_and_to_the_reply_then():
-    row = {
-        "messages": [{"content": "s"}, {"content": "1. at <bbox>"}, {"content": "at <bbox>"}],
-        "objects": {"ref": [], "bbox": [[128, 64], [0, 255]]},
-    }
+    messages = [
+        {"role": "system", "content": "s"},
+        {"role": "user", "content": "1. at <bbox>"},
+        {"role": "assistant", "content": "at <bbox>"},
+    ]
+    objects = {"ref": [], "bbox": [[128, 64], [0, 255]]}
+    row = TrainingRow(messages=messages, objects=objects)
     expected = (
         "s",
         "1. at <|box_start|>(500,250)<|box_end|>",
@@ -98,7 +102,7 @@ def test_training_and_prediction_ask_in_the_same_words(data, tiny):
     row = read_rows(data / "grounded.jsonl")[0]
     question = question_of(row, data)
     predictor = build_predictor({"name": "qwenvl", "vlm": tiny})
-    goal = row["messages"][1]["content"].split("goal is: ")[1].split("\n")[0]
+    goal = row.messages[1].content.split("goal is: ")[1].split("\n")[0]
     video = np.zeros((question.videos[0].length, *question.images[0].shape), np.uint8)
     episode = predictor.start_episode(goal, video)
     episode.observe(question.images[0][None])
@@ -129,10 +133,10 @@ def test_rows_are_a_hugging_face_dataset(data):
     one = dataset[len(rows) - 1]
     parts = one["messages"][1]["content"]
     assert [m["role"] for m in one["messages"]] == ["system", "user", "assistant"]
-    assert sum(p["type"] == "image" for p in parts) == len(one["images"]) == len(rows[-1]["images"])
+    assert sum(p["type"] == "image" for p in parts) == len(one["images"]) == len(rows[-1].images)
     assert sum(p["type"] == "video" for p in parts) == len(one["videos"]) == 1
     assert np.array_equal(
-        np.asarray(one["images"][0].convert("RGB")), read_image(data / rows[-1]["images"][0])
+        np.asarray(one["images"][0].convert("RGB")), read_image(data / rows[-1].images[0])
     )
 
 
@@ -149,9 +153,15 @@ def test_damaged_rows_and_missing_images_are_named(tmp_path, data):
 @pytest.mark.parametrize(
     ("messages", "words"),
     [
-        ([1, 2, 3], "it has no messages"),
-        ([{"role": "robot", "content": 3}], "a message has the role 'robot'"),
+        (3, "messages=3 must be a valid list"),
+        ([1, 2, 3], r"messages\[0\]=1 must be a section of keys"),
+        ([{"role": "robot", "content": "a"}], r"messages\[0\]\.role='robot'\. .*assistant"),
+        ([{"role": "user", "content": "\ud800"}], r"half a character in messages\[0\]\.content"),
         ([{"role": "user", "content": BBOX}], "one message each of system, user and assistant"),
+        (
+            [{"role": role, "content": BBOX} for role in ("system", "user", "assistant")],
+            "has 2 marks <bbox> for 0 points",
+        ),
     ],
 )
 def test_messages_that_are_no_conversation_are_named(messages, words, tmp_path):

@@ -23,7 +23,6 @@ from mme_vla.backbone.base import (
     bind_hook,
     check_positive,
 )
-from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.pi05 import initialise
@@ -32,6 +31,7 @@ from mme_vla.extras.nano.pointer import Pointer
 from mme_vla.extras.nano.tower import CLASSES as OBJECT_CLASSES
 from mme_vla.extras.nano.tower import PlaceTower, TowerConfig, by_class, load_shipped
 from mme_vla.extras.nano.vision import CLASSES, ConvTower
+from mme_vla.extras.trajectories.choice import ChoiceHead
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recompute, Recomputes
 from mme_vla.speed.rtc import rtc_guidance

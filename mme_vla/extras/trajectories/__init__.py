@@ -1,1 +1,1 @@
-"""Learning from a policy's own trajectories: collection, and the log-probability of chunks."""
+"""Learning from a policy's own trajectories: collection, log-probability, a head of choices."""

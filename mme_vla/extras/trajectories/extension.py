@@ -1,5 +1,5 @@
-"""What learning from trajectories adds: it is called from Python alone, so there are no names."""
+"""What learning from trajectories adds: an action head. All else is called from Python."""
 
 from mme_vla.registry import Extension
 
-EXTENSION = Extension()
+EXTENSION = Extension(parts={"head": {"choice": "mme_vla.extras.trajectories.choice"}})

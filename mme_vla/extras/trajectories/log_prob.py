@@ -2,15 +2,15 @@
 Gaussian steps.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.choice import ChoiceHead
-from mme_vla.backbone.flow import FlowHead, HasFlowHead
+from mme_vla.backbone.flow import FlowHead, HasFlowHead, PredictAt
 from mme_vla.errors import UserError
+from mme_vla.extras.trajectories.choice import ChoiceHead, normal_log_density
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.types import Batch, MemoryTokens
 
@@ -70,8 +70,10 @@ def sample_path(
     increments = increments.to(policy.device)
     predict = _predictor(policy, batch, steps, memory)
     with policy.autocast():
-        states = head.sample_path(predict, noise.to(policy.device), increments, deviation)
-        log_prob = head.path_log_prob(predict, states, deviation) if deviation else None
+        states = gaussian_steps(head, predict, noise.to(policy.device), increments, deviation)
+        log_prob = None
+        if deviation:
+            log_prob = steps_log_prob(head, predict, states, deviation)
     return SamplePath(states, deviation, log_prob)
 
 
@@ -88,7 +90,46 @@ def path_log_prob(
         raise UserError("A path without noise has no density: sample it with deviation > 0.")
     predict = _predictor(policy, batch, path.states.shape[1] - 1, memory)
     with policy.autocast():
-        return _flow_head(policy).path_log_prob(predict, path.states, path.deviation)
+        return steps_log_prob(_flow_head(policy), predict, path.states, path.deviation)
+
+
+def gaussian_steps(
+    head: FlowHead, predict: PredictAt, noise: Tensor, increments: Tensor, deviation: float
+) -> Tensor:
+    """Every state x_0 … x_k [b, k + 1, h, a] of k Euler steps with noise: x_{i+1} = x_i − v(x_i)/k
+    + σ·ε_i.
+
+    Args:
+        noise: x_0 [b, h, a].
+        increments: ε [b, k, h, a], standard normal.
+        deviation: σ; 0 gives plain Euler steps.
+    """
+    steps = increments.shape[1]
+    times = head.times(steps, noise.device)
+    velocity = head.velocity(predict, times, {"noise": noise})
+    states = [noise]
+    for index, increment in enumerate(increments.unbind(1)):
+        v = velocity(states[-1], index)
+        scaled = deviation * increment if deviation else None
+        states.append(head.step(states[-1], v, steps, scaled))
+    return torch.stack(states, 1)
+
+
+def steps_log_prob(head: FlowHead, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:
+    """Log-density [b] of the states [b, k + 1, h, a] of `gaussian_steps`: log N(x_0) + Σ log
+    N(x_{i+1} | x_i).
+
+    Gradients reach the network's parameters, and not the states.
+    """
+    steps = path.shape[1] - 1
+    states = path.detach().unbind(1)
+    times = head.times(steps, path.device)
+    velocity = head.velocity(predict, times, {"noise": states[0]})
+    log_prob = normal_log_density(states[0], 1.0)
+    for index, (state, reached) in enumerate(pairwise(states)):
+        error = reached - state + velocity(state, index).to(path.dtype) / steps
+        log_prob = log_prob + normal_log_density(error, deviation)
+    return log_prob
 
 
 def log_prob(
@@ -141,7 +182,7 @@ def _head(policy: MMEPolicy) -> FlowHead:
 
 def _predictor(
     policy: MMEPolicy, batch: Batch, steps: int, memory: MemoryTokens | None
-) -> Callable[[Tensor, int], Tensor]:
+) -> PredictAt:
     """The network's output by the index of a step. Observation and memory are read once."""
     times = _head(policy).times(steps, policy.device)
     if memory is None:

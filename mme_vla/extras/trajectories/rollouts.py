@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.config.sections import read_section
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
@@ -23,6 +22,7 @@ from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.runner import Ending, Rollout, RunFacts
 from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.extras.trajectories.choice import ChoiceHead
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, sample_path
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.base import choose_actions

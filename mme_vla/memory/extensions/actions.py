@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError, check_sizes
 from mme_vla.memory.base import NEVER
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.history import DerivedHistory, History, StorageSpec
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
     RecurrentMemory,
@@ -38,7 +38,7 @@ from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
-class MotionRows(History):
+class MotionRows(DerivedHistory):
     """A history whose tokens are rows of numbers, padded with zeros to the width of a token.
 
     Args:
@@ -57,16 +57,11 @@ class MotionRows(History):
         memory: str,
         device: torch.device | None = None,
     ) -> None:
-        super().__init__(source.spec, source.exec_start)
-        self.clock_starts = source.clock_starts
-        self._source = source
+        super().__init__(source)
         self._read = read
         self._width = width
         self._memory = memory
         self._device = device
-
-    def __len__(self) -> int:
-        return len(self._source)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         rows = self._read(indices[:, 0])

@@ -6,14 +6,15 @@ A row has `messages`, `images`, `videos` and `objects`.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
+from pydantic import BaseModel, Field, model_validator
 from torch import Tensor
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief, did_you_mean, listed, require
+from mme_vla.errors import UserError, did_you_mean, listed, require
 from mme_vla.subgoal.answers import SubgoalHistory
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip, read_image
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, selected_steps, windows
@@ -30,6 +31,7 @@ from mme_vla.subgoal.text import (
     write_boxes,
 )
 from mme_vla.utils import Sums, inside, is_text, read_lines
+from mme_vla.utils.validation import validated
 
 Row = dict[str, Any]
 SETS = {
@@ -154,12 +156,51 @@ def _memer(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
 
 IGNORED = -100  # a label that does not count
 _MARKS = 32  # tokens of the conversation's own marks, at most
-_ROLES = ["system", "user", "assistant"]
 _LIMIT = 2**31  # bytes of a file of rows
 _TIME = 12  # tokens of a video frame's time stamp, at most
 
+Coordinate = Annotated[int, Field(strict=True, ge=0, lt=2**20)]
 
-def read_rows(file: str | Path) -> list[Row]:
+
+class Message(BaseModel):
+    """A part of a conversation."""
+
+    role: Literal["system", "user", "assistant"]
+    content: str
+
+
+class Objects(BaseModel):
+    """The points [row, column] that stand for the marks `BBOX`, in their order."""
+
+    bbox: list[tuple[Coordinate, Coordinate]] = []
+
+
+class TrainingRow(BaseModel):
+    """A row of a file, which any program may have written. Paths are relative to the file."""
+
+    messages: list[Message]
+    images: list[str] = []
+    videos: list[str] = []
+    objects: Objects = Objects()
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        for i, message in enumerate(self.messages):
+            if not is_text(message.content):
+                raise ValueError(f"has half a character in messages[{i}].content.")
+        roles = [message.role for message in self.messages]
+        if roles != ["system", "user", "assistant"]:
+            raise ValueError(
+                "needs one message each of system, user and assistant, and has"
+                f" {listed(roles) or 'none'}."
+            )
+        n_marks = sum(message.content.count(BBOX) for message in self.messages[1:])
+        if n_marks != len(self.objects.bbox):
+            raise ValueError(f"has {n_marks} marks {BBOX} for {len(self.objects.bbox)} points.")
+        return self
+
+
+def read_rows(file: str | Path) -> list[TrainingRow]:
     """Read a JSON-lines file."""
     path = Path(file)
     require(
@@ -167,68 +208,31 @@ def read_rows(file: str | Path) -> list[Row]:
         f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}",
     )
     Sums(path.parent, remedy="Build the training data again").check(path.name)
-    rows = read_lines(path, _check_row, "rows of training data", limit=_LIMIT)
+    rows = read_lines(path, _checked_row, "rows of training data", limit=_LIMIT)
     require(rows, f"{path} holds no row.")
     return rows
 
 
-def _check_row(row: Row) -> Row:
-    """Return a row of a file that any program may have written.
-
-    Raises:
-        UserError: a part is missing or of another type.
-    """
-    messages = row.get("messages")
-    if not isinstance(messages, list) or not all(isinstance(one, dict) for one in messages):
-        raise _row_error("it has no messages")
-    roles = [message.get("role") for message in messages]
-    for role in roles:
-        if role not in _ROLES:
-            raise _row_error(f"a message has the role {brief(role)}, not one of {listed(_ROLES)}")
-    if roles != _ROLES:
-        raise _row_error("expected one message each of system, user and assistant")
-    texts = [message.get("content") for message in messages]
-    if not all(map(is_text, texts)):
-        raise _row_error("the content of a message is no text")
-    n_marks = texts[1].count(BBOX) + texts[2].count(BBOX)
-    for key in ("images", "videos"):
-        names = row.get(key, [])
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise _row_error(f"{key} is {brief(names)}, not a list of files")
-    objects = row.get("objects", {})
-    points = objects.get("bbox", []) if isinstance(objects, dict) else None
-    if not isinstance(points, list) or not all(map(_is_point, points)):
-        raise _row_error(
-            f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
-        )
-    if n_marks != len(points):
-        raise _row_error(f"it has {n_marks} marks {BBOX} for {len(points)} points")
-    return row
+def _checked_row(row: Row) -> TrainingRow:
+    try:
+        return validated(TrainingRow, row, "The row of training data")
+    except UserError as error:
+        raise UserError(f"{error} Build the training data again.") from None
 
 
-def _is_point(point: Any) -> bool:
-    if not isinstance(point, list) or len(point) != 2:
-        return False
-    return all(type(number) is int and 0 <= number < 2**20 for number in point)
-
-
-def _row_error(reason: str) -> UserError:
-    return UserError(f"no row of training data: {reason}. Build the training data again.")
-
-
-def texts_of(row: Row) -> tuple[str, str, str]:
+def texts_of(row: TrainingRow) -> tuple[str, str, str]:
     """Return system, user and answer of a row, points written as the model sees them."""
-    system, user, target = (message["content"] for message in row["messages"])
-    points = [(y, x) for y, x in row.get("objects", {}).get("bbox", [])]
+    system, user, target = (message.content for message in row.messages)
+    points = row.objects.bbox
     n_points = user.count(BBOX)
     return system, write_boxes(user, points[:n_points]), write_boxes(target, points[n_points:])
 
 
-def question_of(row: Row, folder: Path) -> Question:
+def question_of(row: TrainingRow, folder: Path) -> Question:
     """Read the images of a row; paths are relative to `folder`."""
     system, user, target = texts_of(row)
-    images = [read_image(inside(folder, name, "picture")) for name in row.get("images", [])]
-    videos = [Clip.read(inside(folder, name, "video")) for name in row.get("videos", [])]
+    images = [read_image(inside(folder, name, "picture")) for name in row.images]
+    videos = [Clip.read(inside(folder, name, "video")) for name in row.videos]
     return Question(system, user, images, videos, target)
 
 
@@ -242,9 +246,9 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         self.folder = Path(file).parent
         self._sums = Sums(self.folder, remedy="Build the training data again")
         rows = read_rows(file)
-        with_images = [row for row in rows if row.get("images")]
+        with_images = [row for row in rows if row.images]
         require(with_images, f"{file} has no row with an image. Build the training data again.")
-        example = with_images[0]["images"][0]
+        example = with_images[0].images[0]
         height, width, _ = read_image(inside(self.folder, example, "picture")).shape
         n_tokens = round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE)
         n_tokens = min(max(n_tokens, 4), IMAGE_TOKENS)
@@ -256,8 +260,8 @@ class RowDataset(torch.utils.data.Dataset[Question]):
             total = _MARKS
             for text in texts_of(row):
                 total += len(tokenizer.encode(text, add_special_tokens=False))
-            total += len(row.get("images", [])) * (n_tokens + 2)
-            total += len(row.get("videos", [])) * video_tokens
+            total += len(row.images) * (n_tokens + 2)
+            total += len(row.videos) * video_tokens
             if total <= max_length:
                 self.rows.append(row)
         self.left_out = len(rows) - len(self.rows)
@@ -268,7 +272,7 @@ class RowDataset(torch.utils.data.Dataset[Question]):
 
     def __getitem__(self, index: int) -> Question:
         row = self.rows[index]
-        for name in (*row.get("images", []), *row.get("videos", [])):
+        for name in (*row.images, *row.videos):
             self._sums.check(name)
         return question_of(row, self.folder)
 
@@ -318,8 +322,8 @@ def hf_dataset(file: str | Path) -> Any:
         for message in messages:
             for content in message["content"]:
                 content.setdefault("text", None)  # every part has the same keys
-        images = [str(inside(folder, name, "picture")) for name in row.get("images", [])]
-        videos = [str(inside(folder, name, "video")) for name in row.get("videos", [])]
+        images = [str(inside(folder, name, "picture")) for name in row.images]
+        videos = [str(inside(folder, name, "video")) for name in row.videos]
         columns["messages"].append(messages)
         columns["images"].append(images)
         columns["videos"].append(videos)

@@ -5,7 +5,6 @@ import torch
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
 
 from mme_vla import UserError, build_policy
-from mme_vla.backbone.choice import SPREAD, WEIGHT, ChoiceHead
 from mme_vla.extras.nano.pointer import Pointer
 from mme_vla.extras.nano.pretraining import label_cells
 from mme_vla.extras.nano.tower import (
@@ -20,6 +19,7 @@ from mme_vla.extras.nano.tower import (
     summarise,
     within,
 )
+from mme_vla.extras.trajectories.choice import SPREAD, WEIGHT, ChoiceHead
 from mme_vla.testing.small import random_batch
 from mme_vla.types import HistoryTokens
 

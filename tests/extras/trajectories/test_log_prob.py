@@ -6,7 +6,12 @@ from torch.distributions import MultivariateNormal
 
 from mme_vla.backbone.flow import FlowHead
 from mme_vla.errors import UserError
-from mme_vla.extras.trajectories.log_prob import path_log_prob, sample_path
+from mme_vla.extras.trajectories.log_prob import (
+    gaussian_steps,
+    path_log_prob,
+    sample_path,
+    steps_log_prob,
+)
 from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.types import stack_noise
 
@@ -21,7 +26,7 @@ def test_the_log_probability_of_a_path_is_the_density_of_the_joint_normal() -> N
 
     noise = torch.randn(5, 2, 3, generator=generator, dtype=torch.float64)
     increments = torch.randn(5, steps, 2, 3, generator=generator, dtype=torch.float64)
-    path = head.sample_path(linear, noise, increments, deviation)
+    path = gaussian_steps(head, linear, noise, increments, deviation)
     # x_{i+1} = (1 − slope/k)·x_i + σ·ε_i: one joint normal distribution of the k + 1 states of each
     # number.
     gain = 1 - slope / steps
@@ -32,7 +37,9 @@ def test_the_log_probability_of_a_path_is_the_density_of_the_joint_normal() -> N
             mixing[i, j] = deviation * gain ** (i - j)
     joint = MultivariateNormal(torch.zeros(steps + 1, dtype=torch.float64), mixing @ mixing.T)
     expected = joint.log_prob(path.flatten(2).transpose(1, 2)).sum(1)
-    assert torch.allclose(head.path_log_prob(linear, path, deviation), expected, rtol=0, atol=1e-9)
+    assert torch.allclose(
+        steps_log_prob(head, linear, path, deviation), expected, rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("backbone", ["tiny", "nano"])
@@ -76,7 +83,7 @@ def test_a_head_with_deviation_samples_the_path_of_its_noise() -> None:
     def linear(x: torch.Tensor, index: int) -> torch.Tensor:
         return 0.7 * x
 
-    path = head.sample_path(linear, noise["noise"], noise["increments"], 0.3)
+    path = gaussian_steps(head, linear, noise["noise"], noise["increments"], 0.3)
     x = noise["noise"]
     for index in range(steps):
         x = x - 0.7 * x / steps + 0.3 * noise["increments"][:, index]

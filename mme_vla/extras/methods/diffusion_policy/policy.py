@@ -17,13 +17,14 @@ from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.extras.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.extras.methods.diffusion_policy.model import DiffusionNetwork, noise_schedule, sample
 from mme_vla.extras.methods.diffusion_policy.processor import DiffusionBatch, DiffusionProcessor
+from mme_vla.extras.methods.network import MethodPolicy, processor_for
 from mme_vla.integration.film import PooledIntegration
 from mme_vla.memory.base import Memory, full_history
 from mme_vla.model import masked_mean
 from mme_vla.policy.base import draw_noise
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
+from mme_vla.policy.network import MemoryTower
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import INTEGRATIONS, POLICIES
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 
 @POLICIES.register("diffusion_policy")
-class DiffusionPolicy(NetworkPolicy):
+class DiffusionPolicy(MethodPolicy):
     """Diffusion Policy (RoboMME's DP-Unet): a U-Net that denoises chunks conditioned on images,
     state and goal.
 

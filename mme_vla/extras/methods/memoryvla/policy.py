@@ -26,6 +26,7 @@ from mme_vla.extras.methods.memoryvla.model import (
     read_moments,
 )
 from mme_vla.extras.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
+from mme_vla.extras.methods.network import MethodPolicy, processor_for
 from mme_vla.extras.methods.openvla_oft.processor import augment, centre_cut, draw_changes
 from mme_vla.extras.methods.prismatic import IMAGENET, Prismatic
 from mme_vla.memory.base import Memory, full_history
@@ -33,7 +34,7 @@ from mme_vla.model import masked_mean
 from mme_vla.policy.base import draw_noise
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
+from mme_vla.policy.network import MemoryTower
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import PolicyProcessor
@@ -44,7 +45,7 @@ from mme_vla.types import MemoryTokens, Noise, map_noise, to_unit_range
 
 
 @POLICIES.register("memoryvla")
-class MemoryVlaPolicy(NetworkPolicy):
+class MemoryVlaPolicy(MethodPolicy):
     """MemoryVLA: what a moment means (one token of a Llama) and what it looks like (tokens of two
     towers), each with a bank of past moments that is read, fused and written. A diffusion
     transformer predicts the chunk.

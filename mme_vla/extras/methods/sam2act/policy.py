@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import check_choice, require
+from mme_vla.extras.methods.network import processor_for
 from mme_vla.extras.methods.sam2act.config import SAM2ActSizes
 from mme_vla.extras.methods.sam2act.episode import KeyframeEpisode, SceneInputs, decide, watch
 from mme_vla.extras.methods.sam2act.geometry import (
@@ -32,7 +33,7 @@ from mme_vla.extras.methods.sam2act.processor import (
 )
 from mme_vla.extras.methods.sam2act.sam2 import BankState
 from mme_vla.policy.base import PolicyInfo
-from mme_vla.policy.network import NetworkPolicy, processor_for
+from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import POLICIES

@@ -18,6 +18,7 @@ from mme_vla.backbone.flow import EULER_STEPS
 from mme_vla.backbone.siglip import pool_grid
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
+from mme_vla.extras.methods.network import MethodPolicy, processor_for
 from mme_vla.extras.methods.simplememvla.config import SimpleMemVlaSizes
 from mme_vla.extras.methods.simplememvla.episode import VideoEpisode
 from mme_vla.extras.methods.simplememvla.head import ActionHead, Condition
@@ -47,7 +48,7 @@ from mme_vla.memory.base import MemoryModule, full_history
 from mme_vla.policy.base import draw_noise
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
+from mme_vla.policy.network import MemoryTower
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import PolicyProcessor
@@ -63,7 +64,7 @@ counted.
 
 
 @POLICIES.register("simplememvla")
-class SimpleMemVlaPolicy(NetworkPolicy):
+class SimpleMemVlaPolicy(MethodPolicy):
     """SimpleMemVLA: no memory module but a time-stamped video in the prompt, sub-task words, and a
     flow head on them.
 

@@ -8,7 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerTimeModulation, Layout, StaticKV
+from mme_vla.backbone.gemma import JointBlock, LayerTimeModulation, Layout, StaticKV
 from mme_vla.backbone.layers import layout_mask
 from mme_vla.errors import UserError, require
 from mme_vla.integration.modulator import Modulator
@@ -142,10 +142,10 @@ class AttentionWatch(Watch[AttentionMass]):
         of_attention = condition
         if isinstance(condition, LayerTimeModulation):
             of_attention = condition.attention
-        past: KeyValue | StaticKV | None = arguments["past"]
-        if isinstance(past, StaticKV):
-            past = past.past()
-        keys: list[Tensor] = [] if past is None else [past[0]]
+        past: StaticKV | None = arguments["past"]
+        keys: list[Tensor] = []
+        if past is not None:
+            keys.append(past.past()[0])
         row = 0
         q = None
         for segment in segments:

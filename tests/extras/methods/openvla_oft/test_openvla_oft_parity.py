@@ -42,7 +42,7 @@ class Stages:
         self.policy = policy(self.golden, self.about)
         self.backbone: Any = self.policy.backbone
         self.batch = batch(self.golden, self.about)
-        self.memory = self.policy.encode_memory(self.batch.history)
+        self.memory = self.policy.model.memory_tokens(self.batch)
 
     def sequence(self) -> TokenSequence:
         observation = self.backbone.blocks_of(self.batch, fused(self.backbone, self.golden))
@@ -115,7 +115,7 @@ def test_openvla_oft_sequence_hidden_states_and_read_out(stages: Stages) -> None
 
 def test_openvla_oft_loss_and_gradients(stages: Stages) -> None:
     golden, about, policy = stages.golden, stages.about, stages.policy
-    memory = policy.encode_memory(stages.batch.history)
+    memory = policy.model.memory_tokens(stages.batch)
     observation = stages.backbone.blocks_of(stages.batch, fused(stages.backbone, golden))
     output = stages.backbone.predict_from(policy.integration.inject(observation, memory).blocks)
     near(output.detach(), golden["out/predicted_actions"])

@@ -5,8 +5,8 @@ import torch
 from torch.distributions import Categorical, Normal
 
 from mme_vla import UserError
-from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.embodiment.action_space import ActionSpace, Option
+from mme_vla.extras.trajectories.choice import ChoiceHead
 
 LOGITS = torch.tensor([0.5, -1.0, 2.0, 0.0])
 OFFERED = torch.tensor([True, True, False, True])

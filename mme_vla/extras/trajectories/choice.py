@@ -2,12 +2,13 @@
 one pass.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.flow import FlowHead, Predict, PredictAt, normal_log_density
+from mme_vla.backbone.flow import FlowHead, Predict, PredictAt
 from mme_vla.errors import require
 from mme_vla.registry import HEADS
 from mme_vla.types import Noise, Overlap
@@ -15,6 +16,15 @@ from mme_vla.types import Noise, Overlap
 SPREAD = 0.14
 """Standard deviation of a point about the object that is pointed at, in normalised units."""
 WEIGHT = 0.5  # of a mixture's negative log-likelihood, beside the letter's cross-entropy
+
+
+def normal_log_density(x: Tensor, deviation: float) -> Tensor:
+    """Log-density [b] of x [b, …] under independent normal distributions of this standard
+    deviation.
+    """
+    x = x.flatten(1)
+    normaliser = math.log(deviation) + 0.5 * math.log(2 * math.pi)
+    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * normaliser
 
 
 @HEADS.register("choice")
