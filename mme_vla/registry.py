@@ -386,8 +386,8 @@ PERTURBATIONS: Registry[Any] = Registry(
 TRAINING_SETS: Registry[Any] = Registry("kind of training samples", key="training_set")
 """`SampleSpec.kind` → a dataset of such samples, for policies that do not learn from steps.
 
-Called with sources, processor and policy, and with `episodes`, `seed` and `sampled` (false for
-held-out samples).
+Called with sources, processor, policy and caches, with `sampled` (false for held-out samples) and
+the keywords of `TrainingDataset`.
 """
 SIDE_FILES: Registry[Any] = Registry("side file of a dataset", key="side_file")
 """What `convert` keeps of each recording beside a dataset's tables: a module with
