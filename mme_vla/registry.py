@@ -393,10 +393,6 @@ SIDE_FILES: Registry[Any] = Registry("side file of a dataset", key="side_file")
 """What `convert` keeps of each recording beside a dataset's tables: a module with
 `file_of(root, episode)` and `write(episode, path)`.
 """
-SPLIT_POLICIES: Registry[Any] = Registry("dial of a split", key="split_policy")
-"""A dial of `split=stress:<dial>=…` → the policy as this split evaluates it; called with policy,
-split and recordings.
-"""
 REGISTRIES = {
     "memory": MEMORIES,
     "integration": INTEGRATIONS,
@@ -417,7 +413,6 @@ REGISTRIES = {
     "intervention": PERTURBATIONS,
     "training_set": TRAINING_SETS,
     "side_file": SIDE_FILES,
-    "split_policy": SPLIT_POLICIES,
 }
 
 
@@ -429,8 +424,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`,
             `processor`, `subgoal` (a predictor), `task`, `env`, `player`, `reward`, `prompt` (a
             prompt format), `perturbation` (of training, rollouts or probes; also called
-            `history_transform`, `event` and `intervention`), `training_set`, `side_file` (of a
-            dataset) or `split_policy`.
+            `history_transform`, `event` and `intervention`), `training_set` or `side_file`
+            (of a dataset).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...
