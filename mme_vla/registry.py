@@ -385,16 +385,12 @@ PERTURBATIONS: Registry[Any] = Registry(
 TRAINING_SETS: Registry[Any] = Registry("kind of training samples", key="training_set")
 """`SampleSpec.kind` → a dataset of such samples, for policies that do not learn from steps.
 
-Called with sources, processor and policy, and with `episodes`, `seed` and `sampled` (false for
-held-out samples).
+Called with sources, processor, policy and caches, with `sampled` (false for held-out samples) and
+the keywords of `TrainingDataset`.
 """
 SIDE_FILES: Registry[Any] = Registry("side file of a dataset", key="side_file")
 """What `convert` keeps of each recording beside a dataset's tables: a module with
 `file_of(root, episode)` and `write(episode, path)`.
-"""
-SPLIT_POLICIES: Registry[Any] = Registry("dial of a split", key="split_policy")
-"""A dial of `split=stress:<dial>=…` → the policy as this split evaluates it; called with policy,
-split and recordings.
 """
 REGISTRIES = {
     "memory": MEMORIES,
@@ -416,7 +412,6 @@ REGISTRIES = {
     "intervention": PERTURBATIONS,
     "training_set": TRAINING_SETS,
     "side_file": SIDE_FILES,
-    "split_policy": SPLIT_POLICIES,
 }
 
 
@@ -428,8 +423,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`,
             `processor`, `subgoal` (a predictor), `task`, `env`, `player`, `reward`, `prompt` (a
             prompt format), `perturbation` (of training, rollouts or probes; also called
-            `history_transform`, `event` and `intervention`), `training_set`, `side_file` (of a
-            dataset) or `split_policy`.
+            `history_transform`, `event` and `intervention`), `training_set` or `side_file`
+            (of a dataset).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

@@ -57,7 +57,6 @@ class EvaluateCommand:
 
     episodes: Any
     event: Any
-    recordings: Any
     sampling: str
     deterministic: bool
     subgoal: Mapping[str, Any] | None
@@ -154,7 +153,6 @@ def evaluate_one(run: EvaluateCommand, training: str = "") -> None:
             predictor=predictor,
             output=run.output,
             training=training,
-            recordings=run.recordings,
         )
         if policy.info.server is not None:
             logger.info("server: %s", policy.info.server.get("times"))

@@ -8,7 +8,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs import make, metadata
 from mme_vla.envs.base import Environment
-from mme_vla.envs.facts import Candidates, Fact
+from mme_vla.envs.facts import Fact
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
 from mme_vla.errors import SceneError
@@ -74,16 +74,6 @@ class RoboMME(Environment):
                 return None
             row: dict[str, Any] = task.scene_values()
             return row | {"spec": values}
-
-    def candidates(self, env: Any) -> Candidates | None:
-        """What the current sub-task can be carried out on."""
-        candidates: Candidates | None = env.candidates
-        return candidates
-
-    def tool(self, env: Any) -> Sequence[float]:
-        """X and y of the tool, in metres."""
-        tool: Sequence[float] = env.tool
-        return tool
 
     def scene_digest(self, spec: EpisodeSpec) -> str:
         """Without the conditioning video, which does not belong to the scene."""

@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from mme_vla.utils import write_atomically
 
 if TYPE_CHECKING:
@@ -162,16 +160,6 @@ class TaskFacts:
             self._begun = progress.index
             decides = bool(current.operation)
         self._log.add(self._task.visible_facts(recent), decides)
-
-
-def evidence_of(facts: Iterable[Fact]) -> dict[str, np.ndarray]:
-    """Name → the frames that show the fact, ascending."""
-    frames: dict[str, np.ndarray] = {}
-    for fact in facts:
-        first, last = fact.frames
-        span = np.arange(first, last + 1, dtype=np.int64)
-        frames[fact.name] = np.union1d(frames.get(fact.name, span), span)
-    return frames
 
 
 def write_facts(path: Path, episodes: Iterable[tuple[int, str, Sequence[Fact]]]) -> None:

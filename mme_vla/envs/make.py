@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Unpack
 
 from mme_vla.envs import metadata
-from mme_vla.envs.metadata import TASK_NAMES, check_task_name, read_variant
+from mme_vla.envs.metadata import TASK_NAMES, check_task_name
 from mme_vla.envs.observations import Include
 from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.rows import DIFFICULTIES, TaskOptions
@@ -71,7 +71,6 @@ def make_env(
         The environment; call `reset()` first. Close it when done.
     """
     check_names(task, action_space, difficulty, seed)
-    check_sessions(split, 0)
     if max_steps is None:
         max_steps = metadata.step_limit(split)
     if row is not None:
@@ -104,19 +103,6 @@ def make_env(
 
     simulated = make_task(task, render=render, obs_mode=obs_mode, **scene)
     return RoboMMEEnv(simulated, action_space, max_steps, include, render, reward)
-
-
-def check_sessions(split: str, sessions: int) -> None:
-    """Refuse a split with sessions before each episode unless the caller shows them."""
-    variant = read_variant(split)
-    required = 0 if variant is None else variant.sessions
-    require(
-        required == sessions,
-        f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown."
-        " `mme-vla evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded"
-        " ones; callers that show them themselves make the scenes of split=test, which are the"
-        " same.",
-    )
 
 
 def check_names(task: str, action_space: str, difficulty: str | None, seed: int | None) -> None:

@@ -64,10 +64,6 @@ count: repetitions or visits more. containers: more, over nothing. swaps: more o
 more between what is shown and the execution. path: discs more on the way. distractors: more objects
 that are not targets.
 """
-SESSIONS = "sessions"
-"""Unrelated episodes before the actual one, in the same memory: a dial of all tasks that leaves
-scenes unchanged.
-"""
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 HARD, CHALLENGE = "hard", "challenge"
 """The test split's hard episodes (its numbers 3, 7, …, 47), and the held-out scenes of the 2026
@@ -104,16 +100,11 @@ class Variant:
     def options(self) -> TaskOptions:
         """Keyword arguments of the task."""
         options: TaskOptions = {}
-        if self.turned and self.dial != SESSIONS:
+        if self.turned:
             options["stress"] = {self.dial: self.turned}
         if self.twin:
             options["in_view"] = True
         return options
-
-    @property
-    def sessions(self) -> int:
-        """Unrelated episodes that come before each."""
-        return self.turned if self.dial == SESSIONS else 0
 
     def check(self, task: str) -> None:
         """Make sure that a task of the benchmark can be varied so."""
@@ -122,7 +113,7 @@ class Variant:
             f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is"
             " none.",
         )
-        if self.dial and self.dial != SESSIONS:
+        if self.dial:
             dials = [dial for dial, tasks in DIALS.items() if task in tasks]
             require(
                 self.dial in dials,
@@ -142,15 +133,19 @@ def read_variant(split: str) -> Variant | None:
     if not str(split).startswith(STRESS):
         return None
     match = _STRESS.fullmatch(split)
-    known = (*DIALS, SESSIONS)
     if match is None:
         raise UserError(
             f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are"
-            f" {', '.join(known)}."
+            f" {', '.join(DIALS)}."
         )
     require(
-        match[1] in known,
-        f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}",
+        match[1] != "sessions",
+        f"split={split!r}: episodes before each change no scene, so no split has them: `mme-vla"
+        f" probe online=true recordings=<dataset> with=distract:{match[2]}` shows them.",
+    )
+    require(
+        match[1] in DIALS,
+        f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], DIALS)}",
     )
     return Variant(dial=match[1], turned=int(match[2]))
 

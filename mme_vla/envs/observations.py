@@ -5,7 +5,7 @@ benchmark does.
 """
 
 from collections.abc import Collection, Container, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE
 from mme_vla.envs.rendering import links_culled
-from mme_vla.errors import check_known, require
+from mme_vla.errors import require
 
 if TYPE_CHECKING:
     import gymnasium
@@ -81,14 +81,6 @@ class Include:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             require(isinstance(value, bool), f"{name} is {value!r}; expected True or False.")
-
-    @classmethod
-    def from_options(cls, options: Mapping[str, Any]) -> "Include":
-        """Read `include_front_depth=True` and the like, as the benchmark names them."""
-        known = {f"include_{field.name}": field.name for field in fields(cls)}
-        for name in options:
-            check_known("option", name, known)
-        return cls(**{known[name]: value for name, value in options.items()})
 
 
 class AngleTrack:

@@ -97,8 +97,6 @@ def mesa_version() -> int | None:
     return int(major.group(1))
 
 
-_CHECK_SIZE = 8
-
 _systems: dict[str, "sapien.render.RenderSystem"] = {}
 
 
@@ -116,36 +114,6 @@ def keep_renderer(device: "sapien.Device") -> None:
     name = str(device.name)
     if name not in _systems:
         _systems[name] = sapien.render.RenderSystem(device)
-
-
-def renderer_works() -> bool:
-    """Whether each kept renderer still renders; true where none is kept.
-
-    After a lost device or exhausted memory a renderer fails until the process ends.
-    """
-    try:
-        for system in _systems.values():
-            _render_once(system.device)
-    except RuntimeError as error:  # all that Vulkan's errors become
-        logging.getLogger(__name__).warning("the renderer has failed: %s", error)
-        return False
-    return True
-
-
-def _render_once(device: "sapien.Device") -> None:
-    import sapien
-
-    shaders = "default"
-    if device.is_cpu():
-        lean = lean_shaders()
-        if lean is not None:
-            shaders = lean.shader_pack
-    sapien.render.set_camera_shader_dir(shaders)
-    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
-    camera = scene.add_camera("check", _CHECK_SIZE, _CHECK_SIZE, 1.0, 0.01, 1.0)
-    scene.update_render()
-    camera.take_picture()
-    camera.get_picture("Color")
 
 
 PACK = "minimal"

@@ -33,8 +33,6 @@ class PolicyInfo:
     sample_steps: default steps of its sampler.
     supports_rtc: whether it can sample chunks that continue an action prefix (real-time chunking).
     max_actions: actions after which its rollouts end, beside their limit of frames.
-    n_distractor_episodes: unrelated episodes that it is shown before each of its own, as a stress
-        split requires.
     resamples: whether a chunk can be sampled any number of times at one step of an episode.
     max_running: most episodes that it can act in at the same time; None for any number.
     identity: what records call a policy that does not compute here; None for what its configuration
@@ -50,7 +48,6 @@ class PolicyInfo:
     sample_steps: int = 1
     supports_rtc: bool = False
     max_actions: int | None = None
-    n_distractor_episodes: int = 0
     resamples: bool = True
     max_running: int | None = None
     identity: PolicyIdentity | None = None

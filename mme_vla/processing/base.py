@@ -50,13 +50,12 @@ class Sample:
 class SampleSpec:
     """What a training sample and an observation consist of.
 
-    kind: `steps` of an execution, or `keyframes` with depth.
+    kind: `steps` of an execution, or a name in `TRAINING_SETS`.
     window: frames of an observation, the current one last; before the episode's start its first
         frame is repeated.
     consecutive: the frames of the window follow each other; else they are those at which the policy
         acted.
     full_chunks_only: leave out steps with fewer recorded actions ahead than a chunk has.
-    group_size: steps of one episode in a sample; more than 1 for policies that train on sequences.
     cameras: whose images an item holds, in the embodiment's order; None for all.
     history: from a step to the frames of the memory camera that an item holds, the current one
         last; the other cameras then have the current image alone. None for the window of all
@@ -67,7 +66,6 @@ class SampleSpec:
     window: int = 1
     consecutive: bool = True
     full_chunks_only: bool = False
-    group_size: int = 1
     cameras: tuple[str, ...] | None = None
     history: Callable[[int], np.ndarray] | None = None
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
-from mme_vla.data.dataset import ColumnNames, GroupDataset, TrainingDataset
+from mme_vla.data.dataset import ColumnNames, TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.sources import Split, default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
@@ -65,17 +65,10 @@ def prepare_data(
         encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by
             default asked here.
     """
-    # Weights and transforms are for some kinds of samples alone.
-    kind = policy.require_processor().samples.kind
     require(
-        data.weights is None or (policy.loss_weights is not None and kind == "steps"),
+        data.weights is None or policy.loss_weights is not None,
         f"data.weights={data.weights}: {type(policy).__name__} does not weigh samples. Set"
         " data.weights=null.",
-    )
-    require(
-        not build_transforms(data.history_transforms) or kind == "steps",
-        f"data.history_transforms changes frames, and this policy learns from {kind}: leave it"
-        " empty.",
     )
     sources = open_sources(data.sources, policy.embodiment)
     val_episodes: Sequence[int | str] | None = data.val_episodes
@@ -195,30 +188,26 @@ def _samples(
 ) -> Any:
     """The samples of one side. Held-out ones are never changed at random."""
     processor = policy.require_processor()
-    kind = processor.samples.kind
-    if kind != "steps":
-        build = TRAINING_SETS[kind]
-        return build(sources, processor, policy, episodes, seed=seed, sampled=not held_out)
     # A memory has labels of its own: they are not the network's.
     memory_parts: set[Any] = set()
     if policy.memory is not None:
         memory_parts = set(policy.memory.modules())
     labels = labels_read(*(part for part in policy.modules() if part not in memory_parts))
-    dataset = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
-    return dataset(
-        sources,
-        processor,
-        policy.memory,
-        caches,
-        episodes=episodes,
-        action_offset=data.action_offset,
-        mask_padding=data.mask_padding,
-        jitter=data.jitter and not held_out,
-        subgoal=SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text),
-        columns=ColumnNames(labels, data.weights),
-        seed=seed,
-        transforms=() if held_out else build_transforms(data.history_transforms),
-    )
+    options: dict[str, Any] = {
+        "episodes": episodes,
+        "action_offset": data.action_offset,
+        "mask_padding": data.mask_padding,
+        "jitter": data.jitter and not held_out,
+        "subgoal": SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text),
+        "columns": ColumnNames(labels, data.weights),
+        "seed": seed,
+        "transforms": () if held_out else build_transforms(data.history_transforms),
+    }
+    kind = processor.samples.kind
+    if kind != "steps":
+        build = TRAINING_SETS[kind]
+        return build(sources, processor, policy, caches, sampled=not held_out, **options)
+    return TrainingDataset(sources, processor, policy.memory, caches, **options)
 
 
 def check_frozen(policy: Policy, freeze_vision: bool) -> None:

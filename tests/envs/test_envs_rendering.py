@@ -18,7 +18,7 @@ from sapien.render import RenderBodyComponent
 from helpers.env_scenes import Scene
 from mme_vla.envs import make_env, rendering
 from mme_vla.envs.observations import SENSORS, RenderRequest, capture, read_images
-from mme_vla.envs.rendering import PACK, links_culled, renderer_works, without_table
+from mme_vla.envs.rendering import PACK, links_culled, without_table
 from mme_vla.envs.robomme.robot import robots
 from mme_vla.envs.robomme.robot.robots import CELL, coarsen, read_stl, stl_bytes
 from mme_vla.envs.robomme.scene import stage
@@ -106,9 +106,7 @@ def first_images(episode: int) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("renderer")
-def test_later_episodes_use_the_renderer_of_the_first_and_its_failure_is_detected(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_later_episodes_use_the_renderer_of_the_first() -> None:
     first = first_images(0)
     cached = dict(rendering._systems)
     assert cached, "the renderer went with the scene"
@@ -116,13 +114,6 @@ def test_later_episodes_use_the_renderer_of_the_first_and_its_failure_is_detecte
     assert rendering._systems == cached
     assert not np.array_equal(first, other)
     assert np.array_equal(first, first_images(0))
-    assert renderer_works()
-
-    def lost(_: object) -> None:
-        raise RuntimeError("vk::Queue::submit: ErrorDeviceLost")
-
-    monkeypatch.setattr(rendering, "_render_once", lost)
-    assert not renderer_works()
 
 
 # Shaders ------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
 from mme_vla.envs.robomme.robot.robots import description
 from mme_vla.envs.robomme.scene.objects import build_disc
+from mme_vla.envs.robomme.scene.things import AWAY
 from mme_vla.envs.robomme.tasks.pick_xtimes import PickXtimes
 
 PICK = ("PickXtimes", 8)
@@ -69,7 +70,7 @@ def test_objects_stay_where_they_were_put(everything):
 
 def test_a_reset_restores_everything(everything):
     for thing in everything.things:
-        thing.move_away()
+        thing.move_to(sapien.Pose(AWAY, thing.pose.q))
     everything.things[0].entity.set_linear_velocity(np.ones((1, 3), np.float32))
     everything.reset()
     for thing in everything.things:

@@ -18,7 +18,7 @@ from mme_vla.envs import VecEnv, make_vec_env
 from mme_vla.envs.base import Environment
 from mme_vla.envs.vector import pool
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.envs.vector.worker import _portable, begin, settings, simulating_processes
+from mme_vla.envs.vector.worker import begin, portable, settings, simulating_processes
 from mme_vla.errors import SceneError, UserError
 
 
@@ -123,16 +123,59 @@ def test_a_lost_worker_is_reported_and_replaced_while_others_continue(
     assert int(again.observation["front_rgb_list"][0][0, 0, 0]) == 6
 
 
-def test_an_exception_is_reported_and_the_worker_stays(envs: VecEnv) -> None:
+def processes() -> set[int | None]:
+    return {child.pid for child in multiprocessing.active_children()}
+
+
+def test_a_worker_that_dies_in_the_middle_of_a_message_is_reported(envs: VecEnv) -> None:
+    envs.start(0, Job("StopCube", "test", 7))
+    state = envs._workers[0]
+    assert state.connection.poll(30)  # its 4 MB have begun to arrive, and no pipe holds them
+    state.process.kill()
+    state.process.join(30)
+    lost = only(envs.recv())
+    assert type(lost.error) is pool.WorkerCrash
+    expected = "StopCube test episode 7: the worker process died of signal 9"
+    assert lost.info["error_message"] == expected
+    envs.start(0, Job("StopCube", "test", 6))
+    assert not only(envs.recv()).crashed
+
+
+def test_large_replies_wait_until_they_are_taken(envs: VecEnv) -> None:
+    for worker in range(2):
+        envs.start(worker, Job("StopCube", "test", worker))
+    for state in envs._workers:
+        assert state.connection.poll(30)
+    time.sleep(0.5)
+    replies = collect(envs, 2)
+    for worker, reply in replies.items():
+        frames = reply.observation["front_rgb_list"]
+        assert [int(frame[0, 0, 0]) for frame in frames] == [worker + k for k in range(21)]
+
+
+def test_an_exception_is_reported_and_its_worker_replaced(envs: VecEnv) -> None:
+    before = processes()
     envs.start(0, Job("StopCube", "test", 13))
     failed = only(envs.recv())
     assert failed.crashed and type(failed.error) is ValueError
     assert failed.info["exception_type"] == "ValueError"
     assert "StopCube test episode 13: no scene for this seed" in failed.info["error_message"]
+    assert len(processes() - before) == 1
     envs.start(0, Job("StopCube", "test", 2))
     assert not only(envs.recv()).done
     envs.send(0, "raise")
     assert "the arm fell off" in only(envs.recv()).info["error_message"]
+    assert len(processes() - before) == 1
+
+
+def test_a_scene_that_cannot_be_built_leaves_its_worker(envs: VecEnv) -> None:
+    before = processes()
+    envs.send(0, "refuse")
+    failed = only(envs.recv())
+    assert failed.crashed and type(failed.error) is SceneError
+    assert processes() == before
+    envs.start(0, Job("StopCube", "test", 2))
+    assert not only(envs.recv()).done
 
 
 def test_an_exception_of_a_class_that_others_cannot_read_becomes_its_text() -> None:
@@ -140,26 +183,11 @@ def test_an_exception_of_a_class_that_others_cannot_read_becomes_its_text() -> N
         """Of a class that no other process can import."""
 
     for error in (UserError("no"), SceneError("no"), KeyError("no")):
-        assert _portable(error) is error
-    text = _portable(OwnError("no place"))
+        assert portable(error) is error
+    text = portable(OwnError("no place"))
     assert (type(text), str(text)) == (RuntimeError, "OwnError: no place")
     undecodable = UnicodeDecodeError("utf-8", b"x", 0, 1, "bad")
-    assert _portable(undecodable) is undecodable
-
-
-def test_a_worker_whose_renderer_failed_is_replaced(envs: VecEnv) -> None:
-    before = {child.pid for child in multiprocessing.active_children()}
-    envs.send(0, "lose the renderer")
-    failed = only(envs.recv())
-    assert failed.crashed and failed.info["exception_type"] == "RuntimeError"
-    assert "StopCube test episode 30: ErrorDeviceLost" in failed.info["error_message"]
-    assert len({child.pid for child in multiprocessing.active_children()} - before) == 1
-    envs.start(0, Job("StopCube", "test", 6))
-    assert not only(envs.recv()).crashed
-    envs.send(0, "raise")
-    assert only(envs.recv()).crashed
-    envs.start(0, Job("StopCube", "test", 6))
-    assert not only(envs.recv()).crashed
+    assert portable(undecodable) is undecodable
 
 
 def test_misuse_is_refused(envs: VecEnv) -> None:
@@ -174,7 +202,7 @@ def test_misuse_is_refused(envs: VecEnv) -> None:
 
 @pytest.mark.slow
 def test_closing_ends_all_processes_even_busy_ones() -> None:
-    before = {child.pid for child in multiprocessing.active_children()}
+    before = processes()
     envs = VecEnv(
         [Job("StopCube", "test", 0), Job("StopCube", "test", 1)],
         2,
@@ -190,10 +218,19 @@ def test_closing_ends_all_processes_even_busy_ones() -> None:
     envs.close()
     envs.close()
     assert time.monotonic() - start < 20
-    assert {child.pid for child in multiprocessing.active_children()} <= before
+    assert processes() <= before
     for use in (envs.recv, lambda: envs.send(0, 1), lambda: envs.start_next(0)):
         with pytest.raises(UserError, match="closed"):
             use()
+
+
+def test_closing_ends_a_worker_whose_reply_nobody_took() -> None:
+    envs = VecEnv([Job("StopCube", "test", 0)], 1, partial(make_light_env, video=20))
+    envs.start_next(0)
+    assert envs._workers[0].connection.poll(60)
+    start = time.monotonic()
+    envs.close()
+    assert time.monotonic() - start < pool._CLOSING_SECONDS, "it had to be terminated"
 
 
 def tell(file: Path) -> None:

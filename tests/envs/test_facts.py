@@ -3,7 +3,7 @@ beside a recording.
 """
 
 import csv
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,21 @@ from mme_vla import Fact, UserError
 from mme_vla.config.plugins import import_plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes
-from mme_vla.envs.facts import COLUMNS, FactLog, VisibleFact, evidence_of, write_facts
+from mme_vla.envs.facts import COLUMNS, FactLog, VisibleFact, write_facts
 from mme_vla.envs.metadata import TASK_NAMES
+from mme_vla.extras.probing.evidence import EvidenceEpisode
 
 RED = {"cover 0": VisibleFact("red: container_1", {"container_1"})}
 SWAP = {"swap 1": VisibleFact("container_1 and container_2", {"container_1", "container_2"}, True)}
 SLOW_TASKS = ("VideoUnmask", "ButtonUnmaskSwap", "StopCube")
 """One task a way of naming facts; the others are nightly."""
+
+
+def evidence(facts: Sequence[Fact]) -> dict[str, list[int]]:
+    """Name of each fact → the frames that show it."""
+    none = np.zeros(0)
+    episode = EvidenceEpisode("", 0, 0, 0, facts, boundaries=none, states=none, images={})
+    return {name: frames.tolist() for name, frames in episode.evidence.items()}
 
 
 def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
@@ -32,8 +40,7 @@ def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
     first, again, swap = log.facts
     assert (first.frames, again.frames, swap.frames) == ((0, 1), (3, 3), (3, 4))
     assert first.name == again.name and first.value == "red: container_1"
-    frames = {name: frames.tolist() for name, frames in evidence_of(log.facts).items()}
-    assert frames == {"cover 0": [0, 1, 3], "swap 1": [3, 4]}
+    assert evidence(log.facts) == {"cover 0": [0, 1, 3], "swap 1": [3, 4]}
 
 
 def test_a_fact_changes_where_what_it_is_about_is_moved_or_counted_on() -> None:
@@ -212,8 +219,7 @@ def test_facts_of_the_simulator_are_those_once_named_by_hand(task: str) -> None:
         finally:
             env.close()
         assert facts, difficulty
-        frame_facts = {name: frames.tolist() for name, frames in evidence_of(facts).items()}
-        assert frame_facts == former.named, difficulty
+        assert evidence(facts) == former.named, difficulty
         for fact in facts:
             assert fact.value
             needed = [frame for frame in former.decisions if frame >= fact.frames[0]]

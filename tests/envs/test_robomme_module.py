@@ -47,6 +47,8 @@ def test_the_builder_knows_the_benchmarks_episodes(wrapper: ModuleType) -> None:
     assert builder.resolve_episode(49) == (known[49].seed, known[49].difficulty)
     with pytest.raises(UserError, match="0 to 49, and no 50"):
         builder.make_env_for_episode(50)
+    with pytest.raises(UserError, match="include_front_depth"):
+        builder.make_env_for_episode(0, include_depth=True)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.envs.vector import worker as vector_worker
+from mme_vla.errors import SceneError
 
 FRAME = (256, 256, 3)
 
@@ -32,9 +32,8 @@ class LightEnv:
             time.sleep(60)
         if action == "raise":
             raise RuntimeError("the arm fell off")
-        if action == "lose the renderer":
-            vector_worker.renderer_works = lambda: False
-            raise RuntimeError("ErrorDeviceLost")
+        if action == "refuse":
+            raise SceneError("no object found a place")
         self.steps += 1
         while isinstance(action, Path) and not action.exists():
             time.sleep(0.01)

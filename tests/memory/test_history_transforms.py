@@ -14,9 +14,10 @@ from helpers.probe_fakes import probed, reader
 from mme_vla import Perturbation, UserError, register
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.cache_building import ensure_cache
-from mme_vla.data.dataset import GroupDataset, TrainingDataset
+from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.statistics import compute_norm_stats
+from mme_vla.extras.methods.memoryvla.groups import GroupDataset
 from mme_vla.extras.nano.learning import Decisions, statistics
 from mme_vla.extras.probing.arms import options_of, read_arm
 from mme_vla.extras.probing.feed import Feed
@@ -189,11 +190,10 @@ def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.Monkey
     assert len(recorded) == 4 and not np.array_equal(recorded, past)
 
 
-def test_the_times_of_a_group_are_transformed(sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_times_of_a_group_are_transformed(sample: Any) -> None:
     sources, processor, caches = sample
-    monkeypatch.setattr(Processor, "samples", replace(processor.samples, group_size=4))
     groups = [
-        GroupDataset(sources, processor, LastFrames(), caches, transforms=t)
+        GroupDataset(sources, processor, LastFrames(), caches, group_size=4, transforms=t)
         for t in ((), [Speed(0.5)])
     ]
     base, slow = (group[1] for group in groups)

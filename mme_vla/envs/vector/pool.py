@@ -19,12 +19,10 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, Unpack
-
-import numpy as np
 
 from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.base import environment, open_episode
@@ -33,7 +31,7 @@ from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.rows import SceneOptions
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import listed, require, text_of
+from mme_vla.errors import SceneError, UserError, listed, require, text_of
 from mme_vla.utils.processes import end_with_parent, signals_deferred
 
 
@@ -111,20 +109,17 @@ class WorkerCrash(RuntimeError):  # noqa: N818  (the name that records of crashe
 
 _CLOSING_SECONDS = 5.0
 _STARTING_SECONDS = 120.0
-_NEXT_PIECE_SECONDS = 0.02
 
 
 @dataclass
 class _Worker:
     process: Any
     connection: Any
-    block: Any
     job: Job | None = None
     running: bool = False
     """A command was given and its result is due."""
     resetting: bool = False
     deadline: float = math.inf
-    arrays: list[np.ndarray] = field(default_factory=list)
 
     @property
     def begun(self) -> Job:
@@ -220,8 +215,8 @@ class VecEnv:
     def recv(self, timeout: float | None = None) -> list[Reply]:
         """Wait until at least one worker is ready, and take the replies of all that are.
 
-        A worker that died or hangs, or whose renderer failed, is replaced, and reported by a reply
-        with `crashed` and the status `error`; the others continue.
+        A worker that died, hangs or raised anything but a `UserError` or `SceneError` is replaced.
+        Its reply has `crashed` and the status `error`; the others continue.
 
         Args:
             timeout: seconds that this call waits at most, whatever hangs; None waits as long as
@@ -254,9 +249,7 @@ class VecEnv:
         for state in self._workers:
             try:
                 protocol.send(state.connection, protocol.CLOSE)
-                # A worker that waits to send a piece takes this for the acknowledgement, then the
-                # pipe is closed.
-                state.connection.close()
+                state.connection.close()  # ends the sending of a reply that nobody has taken
             except OSError:
                 pass  # it is gone already
         until = time.monotonic() + _CLOSING_SECONDS
@@ -275,13 +268,12 @@ class VecEnv:
 
     def _spawn(self) -> _Worker:
         connection, remote = self._context.Pipe()
-        block = self._context.RawArray("B", protocol.BLOCK_BYTES)
-        work = (serve, imported_plugins(), remote, block, self._factory)
+        work = (serve, imported_plugins(), remote, self._factory)
         process = self._context.Process(target=begin, args=(settings(), *work), daemon=True)
         with signals_deferred():
             process.start()
         remote.close()
-        return _Worker(process, connection, block)
+        return _Worker(process, connection)
 
     def _idle(self, worker: int) -> _Worker:
         self._require_open()
@@ -295,7 +287,6 @@ class VecEnv:
     def _command(self, worker: int, *message: Any) -> None:
         state = self._workers[worker]
         state.running = True
-        state.arrays = []
         state.deadline = time.monotonic() + self.timeout
         if state.resetting:
             state.deadline += _STARTING_SECONDS
@@ -305,25 +296,19 @@ class VecEnv:
             self._lost.append(self._crashed(worker, protocol.last_words(state.process)))
 
     def _poll(self, index: int, state: _Worker) -> Reply | None:
-        """Take what a worker has sent; its reply if that is complete."""
+        """Take the reply of a worker, if it has sent one."""
         try:
-            # A long video comes in many pieces, each sent when the last was taken; wait for the
-            # next one.
-            while state.connection.poll(_NEXT_PIECE_SECONDS if state.arrays else 0):
-                kind, *content = protocol.receive(state.connection)
-                if kind == protocol.PIECE:
-                    state.arrays += protocol.read(state.block, content[0])
-                    state.deadline = max(state.deadline, time.monotonic() + self.timeout)
-                    protocol.send(state.connection, protocol.CONTINUE)
-                elif kind == protocol.RESULT:
+            if state.connection.poll():
+                kind, content = protocol.receive(state.connection)
+                if kind == protocol.RESULT:
                     state.running = False
-                    outcome = protocol.restore(content[0], state.arrays)
-                    return Reply.of_outcome(index, state.begun, state.resetting, outcome)
-                elif kind == protocol.FAILURE:
+                    return Reply.of_outcome(index, state.begun, state.resetting, content)
+                if isinstance(content, UserError | SceneError):
                     state.running = False
-                    return Reply.of_failure(index, state.begun, state.resetting, *content)
-                elif kind == protocol.LOST:
-                    return self._replace(index, *content)
+                    return Reply.of_failure(index, state.begun, state.resetting, content)
+                # After any other error the process may be of no further use: a renderer that has
+                # lost its device fails until its process ends.
+                return self._replace(index, content)
         except (EOFError, OSError):
             return self._crashed(index, protocol.last_words(state.process))
         if time.monotonic() > state.deadline:
@@ -337,6 +322,7 @@ class VecEnv:
         """Start a new process for a worker, and report the failure of its command."""
         old = self._workers[index]
         old.connection.close()
+        old.process.join(1.0)  # unless it hangs, it closes its environment and ends by itself
         protocol.end(old.process)
         self._workers[index] = self._spawn()
         return Reply.of_failure(index, old.begun, old.resetting, error)
@@ -345,10 +331,8 @@ class VecEnv:
         require(not self._closed, "The environments are closed; make new ones.")
 
 
-def serve(plugins: Sequence[str], connection: Any, block: Any, factory: Callable[..., Any]) -> None:
-    """The work of a worker process: run commands until `CLOSE`, until the connection ends, or until
-    the renderer has failed.
-    """
+def serve(plugins: Sequence[str], connection: Any, factory: Callable[..., Any]) -> None:
+    """The work of a worker process: run commands until `CLOSE` or the end of the connection."""
     import_plugins(plugins)
     end_with_parent()
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
@@ -367,15 +351,12 @@ def serve(plugins: Sequence[str], connection: Any, block: Any, factory: Callable
                         env = None
                     env = factory(**arguments[0])
                     outcome: Any = env.reset(**arguments[1])
-                elif command == protocol.STEP:
-                    outcome = env.step(arguments[0])
                 else:
-                    continue
+                    outcome = env.step(arguments[0])
             except Exception as error:
-                if not protocol.send_error(connection, error):
-                    return
+                protocol.send(connection, protocol.FAILURE, protocol.portable(error))
             else:
-                protocol.hand_over(connection, block, outcome)
+                protocol.send(connection, protocol.RESULT, outcome)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
     finally:

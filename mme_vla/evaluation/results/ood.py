@@ -234,14 +234,13 @@ def extrapolation(
     """Success against the amount of what grows, over all splits of a model: training, test, stress
     and OOD.
 
-    Twins, splits with sessions, and scenes that cannot be built or are other ones here are left
-    out.
+    Twins, and scenes that cannot be built or are other ones here, are left out.
     """
     counted = []
     amounts = []
     for record in merge(records, conflicts):
         variant = read_variant(record.split)
-        if variant is not None and (variant.twin or variant.sessions):
+        if variant is not None and variant.twin:
             continue
         if record.task not in AMOUNTS:
             continue

@@ -24,8 +24,8 @@ from mme_vla.embodiment.robomme import (
     choice_action,
 )
 from mme_vla.envs.base import OPTIONS, EpisodeEnv, Hold, environment, open_episode
-from mme_vla.envs.make import ROBOMME, check_sessions, make_env
-from mme_vla.envs.metadata import BASE, DEFAULT_STEPS, STICK_TASKS
+from mme_vla.envs.make import ROBOMME, make_env
+from mme_vla.envs.metadata import DEFAULT_STEPS, STICK_TASKS
 from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
@@ -515,23 +515,16 @@ def make_rollout_env(
     robot: Embodiment = ROBOMME_JOINT,
     max_actions: int | None = None,
     oracle: bool = False,
-    sessions: int = 0,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
     base: makes the environment itself from `task`, `split`, `episode` and `max_steps` (`base_env`).
     max_steps: see `ChunkEnv`, or a function that gives it for a task.
-    sessions: unrelated episodes that the caller shows the policy before, as
-        `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test
-        split.
     videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
     run: its name, in the videos.
     robot, max_actions: the policy's.
     oracle: see `ChunkEnv`.
     """
-    if sessions:
-        check_sessions(split, sessions)
-        split = BASE
     video = None
     if videos is not None:
         folder, save_on = videos

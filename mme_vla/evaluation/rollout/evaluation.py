@@ -12,10 +12,9 @@ from typing import Any, NamedTuple, Unpack
 from mme_vla.config.sections import read_section, without
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
-from mme_vla.envs.make import ROBOMME, check_sessions, make_env
-from mme_vla.envs.metadata import read_variant
+from mme_vla.envs.make import ROBOMME, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.errors import UserError, counted, require
+from mme_vla.errors import UserError, counted
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, RecordLog, finished, merge, read_records
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
@@ -37,7 +36,6 @@ from mme_vla.policy.identity import identify_policy
 from mme_vla.policy.run_folders import check_output, locate_checkpoint
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import subgoal_kind
-from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.utils import remove_drafts, safe_name
@@ -121,7 +119,6 @@ def evaluate(
     name: str | None = None,
     base: Callable[..., Any] = make_env,
     show_progress: bool = True,
-    recordings: Any = None,
     event: str | Sequence[str] | None = None,
     **settings: Unpack[RolloutKeywords],
 ) -> Evaluation:
@@ -140,7 +137,6 @@ def evaluate(
         subgoal: a predictor, or the name of one, for policies that read subgoals.
         name: what records call the policy; its own name by default.
         base: makes an environment with the benchmark's interface, importable by name.
-        recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
         event: what happens in every episode, such as `"pause:100@subtask:2"`; of a list each by
             itself. Every episode runs without it too, in `output` itself.
         show_progress: whether a progress bar is shown.
@@ -175,7 +171,6 @@ def evaluate(
         name=name,
         predictor=label,
         output=output,
-        recordings=recordings,
     )
 
 
@@ -244,7 +239,6 @@ def evaluate_policy(
     predictor: str | None = None,
     output: str | Path | None = None,
     training: str = "",
-    recordings: Any = None,
 ) -> Evaluation:
     """Evaluate a loaded policy: what the command and `mme_vla.evaluate` have in common.
 
@@ -255,7 +249,6 @@ def evaluate_policy(
         output: the run's folder; None for the one that the same command finds again.
         training: of several trainings the one that this is; its records are in a folder of that
             name below the run's.
-        recordings: datasets whose episodes a split shows before its own.
     """
     facts = facts_of(policy, name, options.source, settings, predictor)
     folder = default_output(facts) if output is None else Path(output).expanduser()
@@ -265,7 +258,6 @@ def evaluate_policy(
         count += f", shared as {options.shard.index}/{options.shard.count},"
     logger.info("%s into %s", count, folder)
     notes = {**(options.notes or {}), "composition": facts.composition}
-    policy = policy_of_split(policy, settings.split, recordings)
     options = replace(options, notes=notes)
     run = EvaluationRun(policy, jobs, folder, facts, settings, options)
     return run.run_with_events(events)
@@ -316,23 +308,6 @@ def default_output(facts: RunFacts) -> Path:
     if facts.run.is_shipped and not folder.exists():
         folder = Path("outputs", "evaluation", str(facts.checkpoint), run)
     return folder
-
-
-def policy_of_split(policy: Policy, split: str, recordings: Any = None) -> Policy:
-    """The policy as a split evaluates it.
-
-    Args:
-        recordings: datasets whose episodes a split shows before its own (`stress:sessions=<n>`).
-    """
-    variant = read_variant(split)
-    if variant is not None and variant.dial in SPLIT_POLICIES:
-        wrapped: Policy = SPLIT_POLICIES[variant.dial](policy, split, recordings)
-        return wrapped
-    require(
-        not recordings,
-        f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.",
-    )
-    return policy
 
 
 @dataclass(frozen=True)
@@ -390,7 +365,6 @@ class EvaluationRun:
         # Refuse what can be refused, before the folder is claimed.
         self.policy.require_processor().require_stats()
         check_subgoals(self.policy, options.subgoals)
-        check_sessions(self.settings.split, self.policy.info.n_distractor_episodes)
         if options.base is make_env:
             environment(self.settings.env).check_embodiment(self.policy.embodiment)
         decisive = run_settings(
@@ -475,7 +449,6 @@ class EvaluationRun:
         settings = self.settings
         info = self.policy.info
         base = self.options.base
-        sessions = 0
         if base is make_env:
             base = base_env(
                 settings.env,
@@ -483,7 +456,6 @@ class EvaluationRun:
                 settings.render,
                 only_possible=settings.only_possible,
             )
-            sessions = info.n_distractor_episodes
         videos = None
         if settings.video != "none":
             videos = (str(self.folder / VIDEOS), settings.video)
@@ -495,7 +467,6 @@ class EvaluationRun:
             run=self.facts.run.label,
             robot=self.policy.embodiment,
             max_actions=settings.max_actions or info.max_actions,
-            sessions=sessions,
         )
         # It begins without jobs: `Waiting` hands them out.
         return VecEnv([], workers, make, settings.timeout_s)

@@ -26,7 +26,10 @@ EXTENSION = Extension(
             "subtask": f"{_METHODS}.simplememvla.subtask",
         },
         "prompt": dict.fromkeys(("openvla", "openvla_subgoal"), f"{_METHODS}.openvla_oft.prompt"),
-        "training_set": {"keyframes": f"{_METHODS}.sam2act.keyframes"},
+        "training_set": {
+            "groups": f"{_METHODS}.memoryvla.groups",
+            "keyframes": f"{_METHODS}.sam2act.keyframes",
+        },
         "side_file": {"keyframes": f"{_METHODS}.sam2act.keyframes"},
     },
     configs=Path(__file__).parent / "configs",

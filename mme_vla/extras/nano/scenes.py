@@ -32,7 +32,7 @@ from mme_vla.envs.robomme.scene.objects import (
     Disc,
 )
 from mme_vla.envs.robomme.scene.predicates import pressed
-from mme_vla.envs.robomme.scene.things import UNDER_THE_FLOOR, Thing, distance_xy
+from mme_vla.envs.robomme.scene.things import AWAY, UNDER_THE_FLOOR, Thing, distance_xy
 from mme_vla.extras.nano.tower import CLASSES
 from mme_vla.processing.images import resize_with_pad_uint8
 from mme_vla.utils import write_atomically
@@ -247,7 +247,7 @@ def _relocate(thing: Any, rng: np.random.Generator) -> None:
     name = _class_of(thing)
     home = thing.initial_pose
     if name == "container" and rng.random() < 0.5:
-        return thing.move_away()
+        return thing.move_to(_pose(AWAY, thing.pose.q))
     if rng.random() < 0.3:
         return thing.move_to(home)
     lifted = rng.uniform(0, 0.15) if "cube" in name and rng.random() < 0.2 else 0.0

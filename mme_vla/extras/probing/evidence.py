@@ -14,7 +14,7 @@ import numpy as np
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs.base import Environment, environment
-from mme_vla.envs.facts import Fact, evidence_of
+from mme_vla.envs.facts import Fact
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
@@ -49,7 +49,12 @@ class EvidenceEpisode:
     @property
     def evidence(self) -> dict[str, np.ndarray]:
         """Name of each fact → the frames that show it, ascending."""
-        return evidence_of(self.facts)
+        frames: dict[str, np.ndarray] = {}
+        for fact in self.facts:
+            first, last = fact.frames
+            span = np.arange(first, last + 1, dtype=np.int64)
+            frames[fact.name] = np.union1d(frames.get(fact.name, span), span)
+        return frames
 
 
 def record_evidence(

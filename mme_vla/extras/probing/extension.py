@@ -32,7 +32,6 @@ STREAM = (
 
 EXTENSION = Extension(
     parts={
-        "split_policy": {"sessions": "mme_vla.extras.probing.probed"},
         "perturbation": {
             **dict.fromkeys(STREAM, "mme_vla.extras.probing.streams"),
             **dict.fromkeys(MEMORY, "mme_vla.extras.probing.interventions"),

@@ -13,18 +13,15 @@ import torch
 from torch import Tensor
 
 from mme_vla.data.recording import SUBGOAL, stored_frames
-from mme_vla.data.sources import open_sources
-from mme_vla.envs.metadata import SESSIONS, read_variant
 from mme_vla.errors import UserError
-from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of, read_arm
+from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of
 from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
 from mme_vla.extras.probing.interventions import Moment
-from mme_vla.extras.probing.recordings import Recording, all_recordings
+from mme_vla.extras.probing.recordings import Recording
 from mme_vla.extras.probing.streams import Shown
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode, Failure
 from mme_vla.processing.prompt import subgoal_kind
-from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.types import Noise, stack_noise
 
 
@@ -325,7 +322,6 @@ class ProbedPolicy(Policy):
         arm_config = {"probe": [arm.name, options_of(arm)]} if arm.parts else {}
         self.config = {**inner.config, **arm_config}
         self.horizon = inner.horizon
-        # Episodes of a stress split's sessions count (`with_sessions`), those of an arm do not.
         self.info = PolicyInfo(
             sample_steps=inner.info.sample_steps,
             max_actions=inner.info.max_actions,
@@ -511,34 +507,3 @@ def _show_all(recordings: Sequence[Recording], running: Episode, policy: Policy)
             of_recording = stored[stored >= start] - start
         recording.show(running, 0, recording.length, of_recording, video=True)
         start += recording.length
-
-
-@SPLIT_POLICIES.register(SESSIONS)
-def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
-    """The policy as a split with sessions evaluates it: it observes them before each episode.
-
-    They are the first of the recorded episodes, the same before every episode, and count as part of
-    its video.
-
-    Args:
-        recordings: datasets, as `data.sources` names them; recorded episodes; or None.
-    """
-    variant = read_variant(split)
-    count = 0 if variant is None else variant.sessions
-    if not count:
-        return policy
-    episodes: list[Recording] = []
-    if isinstance(recordings, Sequence) and all(isinstance(one, Recording) for one in recordings):
-        episodes = list(recordings)
-    elif recordings is not None:
-        episodes = all_recordings(open_sources(recordings, policy.embodiment))
-    if policy.embodiment.readings or count > len(episodes):
-        raise UserError(
-            f"split={split} needs {count} recorded episodes to take from, and there are"
-            f" {len(episodes)}: name them with recordings=…."
-        )
-    probed = ProbedPolicy(policy, read_arm(f"distract:{count}"), episodes).eval()
-    probed.info = replace(probed.info, n_distractor_episodes=count)
-    names = [recording.name for recording in probed.sessions]
-    probed.config = {**probed.config, "sessions": names}
-    return probed

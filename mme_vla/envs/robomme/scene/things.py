@@ -66,10 +66,6 @@ class Thing:
         """Teleport the object in the midst of its motion: it keeps its velocity."""
         self.entity.set_pose(pose)
 
-    def move_away(self) -> None:
-        """Take the object out of the scene, keeping its orientation."""
-        self.move_to(sapien.Pose(AWAY, self.pose.q))
-
     def set_home(self, pose: sapien.Pose) -> None:
         """Make `pose` the place the object is restored to, and put it there."""
         self.initial_pose = pose

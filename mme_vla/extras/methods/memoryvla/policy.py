@@ -127,7 +127,7 @@ class MemoryVlaPolicy(MethodPolicy):
         processor = processor_for(
             MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it"
         )
-        is_alone = processor is not None and processor.samples.group_size == 1
+        is_alone = processor is not None and processor.group_size == 1
         require(
             sections.memory or not is_alone,
             "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other;"
@@ -185,8 +185,8 @@ class MemoryVlaPolicy(MethodPolicy):
     @property
     def group_size(self) -> int:
         """Moments of a training sample: its processor's, else its configuration's."""
-        if self.processor is not None:
-            return self.processor.samples.group_size
+        if isinstance(self.processor, MemoryVlaProcessor):
+            return self.processor.group_size
         return int(PolicySections.of(self.config).processor["group_size"])
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:

@@ -78,6 +78,8 @@ class MemoryVlaProcessor(OpenVlaProcessor):
     """
 
     stats_spec = StatsSpec(horizon=1, every=True, extremes=True, exact=True, video=True)
+    group_size = 1
+    """Steps of one episode in a training sample."""
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -85,7 +87,9 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         settings = read_section(MemoryVlaProcessorSettings, config, "processor", others=True)
         built = super().from_config(without(config, "group_size"))
         camera = built.embodiment.memory_camera
-        built.samples = SampleSpec(group_size=settings.group_size, cameras=(camera,))
+        built.group_size = settings.group_size
+        kind = "steps" if settings.group_size == 1 else "groups"
+        built.samples = SampleSpec(kind, cameras=(camera,))
         return built
 
     @classmethod
@@ -188,4 +192,4 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         )
 
     def to_config(self) -> dict[str, Any]:
-        return {**super().to_config(), "name": "memoryvla", "group_size": self.samples.group_size}
+        return {**super().to_config(), "name": "memoryvla", "group_size": self.group_size}

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset
 
+from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import RawEpisode
 from mme_vla.data.waypoints import Motions, find_motions
@@ -24,6 +25,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.errors import UserError, require
 from mme_vla.extras.methods.sam2act.processor import Shot
+from mme_vla.memory.perturbation import Perturbation
 from mme_vla.policy.base import Policy
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.registry import SIDE_FILES, TRAINING_SETS
@@ -331,12 +333,20 @@ def keyframe_dataset(
     sources: Sequence[EpisodeSource],
     processor: PolicyProcessor,
     policy: Policy,
-    episodes: Sequence[np.ndarray],
+    caches: Sequence[VisionCache] | None,
     *,
+    episodes: Sequence[np.ndarray],
     seed: int,
     sampled: bool,
+    transforms: Sequence[Perturbation],
+    **_: Any,
 ) -> KeyframeDataset:
     """The samples of a policy that trains on runs of `policy.keyframes` keyframes, else of one."""
+    require(
+        not transforms,
+        "data.history_transforms changes frames, and this policy learns from keyframes: leave it"
+        " empty.",
+    )
     length = getattr(policy, "keyframes", 1)
     return KeyframeDataset(
         sources, processor, length, episodes=episodes, seed=seed, sampled=sampled

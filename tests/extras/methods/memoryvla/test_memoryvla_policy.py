@@ -6,8 +6,8 @@ import torch
 
 from helpers.memoryvla_golden import reached
 from mme_vla import UserError, build_policy
-from mme_vla.data.dataset import GroupDataset
 from mme_vla.data.sources import open_sources
+from mme_vla.extras.methods.memoryvla.groups import GroupDataset
 from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.extras.methods.memoryvla.processor import GroupBatch
 
@@ -37,7 +37,8 @@ def states(count: int) -> np.ndarray:
 
 
 def groups(policy: MemoryVlaPolicy) -> GroupDataset:
-    return GroupDataset(open_sources(["sample"], policy.embodiment), policy.require_processor())
+    sources = open_sources(["sample"], policy.embodiment)
+    return GroupDataset(sources, policy.require_processor(), group_size=4)
 
 
 def test_a_group_is_of_one_episode_in_the_order_of_time_and_sampled_anew_every_epoch(

@@ -1,5 +1,6 @@
 """`BenchmarkEnvBuilder`: the episodes of one task, under the official class's names."""
 
+from dataclasses import fields
 from pathlib import Path
 
 from mme_vla.envs import metadata
@@ -7,7 +8,7 @@ from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.make import check_names, make_env
 from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.observations import Include
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, check_known
 
 __all__ = ["BenchmarkEnvBuilder"]
 
@@ -90,10 +91,13 @@ class BenchmarkEnvBuilder:
             UserError: no such episode, an unknown option, a missing package, or no Vulkan driver.
         """
         seed, difficulty = self.resolve_episode(episode_idx)
+        known = {f"include_{field.name}": field.name for field in fields(Include)}
+        for name in include:
+            check_known("option", name, known)
         env = make_env(
             self.env_id, action_space=self.action_space, seed=seed, difficulty=difficulty,
             max_steps=self.max_steps if max_steps is None else max_steps,
-            include=Include.from_options(include),
+            include=Include(**{known[name]: value for name, value in include.items()}),
         )  # fmt: skip
         assert isinstance(env, RoboMMEEnv)
         return env
