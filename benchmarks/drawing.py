@@ -24,9 +24,9 @@ from mme_vla.cli.record import record_episode
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.envs.robomme.recording.outputs import Job as Demonstration
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
-from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.subgoal.oracle import Oracle
@@ -110,7 +110,7 @@ def episode(policy: MMEPolicy, name: str, job: Job, steps: int, draw: str) -> Me
     subgoals = (
         Oracle("grounded") if policy.require_processor().prompt_format.reads_subgoal else None
     )
-    facts = RunFacts(name, "untrained", settings.seed, max_steps=steps)
+    facts = RunKey(name, "untrained", settings.seed)
     begun = time.process_time(), time.perf_counter()
     Rollout(policy, envs, facts, settings, records.append, subgoals).run([job])
     cpu, wall = time.process_time() - begun[0], time.perf_counter() - begun[1]

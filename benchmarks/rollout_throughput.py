@@ -18,9 +18,9 @@ from functools import partial
 from timing import machine
 
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
-from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy
@@ -75,8 +75,8 @@ def measure(
         max_steps=args.steps, workers=workers, max_batch=max_batch, render=not args.no_render
     )
     base = base_env("mme_vla", policy.embodiment, render=not args.no_render)
-    make = partial(make_rollout_env, base=base, max_steps=args.steps)
-    facts = RunFacts(args.model, "untrained", settings.seed, max_steps=args.steps)
+    make = partial(make_rollout_env, base=base)
+    facts = RunKey(args.model, "untrained", settings.seed)
     records: list[EpisodeRecord] = []
     with VecEnv([], workers, make) as envs:
         short = [Job("StopCube", "test", 40 + worker) for worker in range(workers)]

@@ -48,15 +48,15 @@ def checkpoint_number(checkpoint: int | str) -> int | str:
 
 class RunKey(NamedTuple):
     """What one pass over the benchmark is a pass of: one policy, one training, one checkpoint, one
-    model seed.
+    model seed. All records of a run have it in common; the fields are those of `EpisodeRecord`.
     """
 
     model: str
-    subgoal: str | None
-    memory_budget: int | None
     checkpoint: int | str
     model_seed: int
-    split: str
+    split: str = "test"
+    subgoal: str | None = None
+    memory_budget: int | None = None
     composition: str | None = None
     training: TrainingIdentity | None = None
     event: str | None = None
@@ -127,18 +127,8 @@ class EventEntry(TypedDict):
     step: Integer | None
 
 
-class OfRun:
-    """What belongs to a run: it has the fields of a `RunKey`."""
-
-    @property
-    def run(self) -> RunKey:
-        values = {name: getattr(self, name) for name in RunKey._fields}
-        values["checkpoint"] = checkpoint_number(values["checkpoint"])
-        return RunKey(**values)
-
-
 @dataclass(frozen=True)
-class EpisodeRecord(OfRun):
+class EpisodeRecord:
     """One evaluated episode.
 
     model: name of the model (`framesamp_modul`).
@@ -230,6 +220,10 @@ class EpisodeRecord(OfRun):
     def named_scene(self) -> str | None:
         """The digest of the scene; None where there is none."""
         return None if self.scene in (NO_VALUES, NOT_BUILT) else self.scene
+
+    @property
+    def run(self) -> RunKey:
+        return RunKey(*(getattr(self, name) for name in RunKey._fields))
 
     @property
     def key(self) -> EpisodeKey:

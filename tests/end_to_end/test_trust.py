@@ -15,8 +15,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from mme_vla import MMEPolicy, UserError
+from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.rollout.evaluation import default_output
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.processing.tokenizer import PALIGEMMA
 from mme_vla.testing.small import SMALL_VISION, small_policy
 from mme_vla.utils import SUMS, check_sums, inside
@@ -184,7 +184,7 @@ def test_the_network_is_requested_nothing_but_the_librarys_tokenizer(
 @pytest.mark.parametrize("name", ["../../x", "/x", "a/b", "..", ""])
 def test_the_name_of_a_checkpoint_decides_no_place(name: str) -> None:
     with pytest.raises(UserError, match="cannot name a folder"):
-        default_output(RunFacts(name, 3, 42))
+        default_output(RunKey(name, 3, 42))
 
 
 def test_nothing_is_resolved_from_the_environment(

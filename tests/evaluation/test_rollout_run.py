@@ -21,7 +21,7 @@ from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.evaluation import (
     EvaluationRun,
     RunOptions,
@@ -30,7 +30,6 @@ from mme_vla.evaluation.rollout.evaluation import (
     default_output,
 )
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import Claims, find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
@@ -259,10 +258,10 @@ def test_a_shipped_policy_has_a_folder_of_its_name_and_old_runs_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    facts = RunFacts("framesamp_modul-every_8-grid_1", "nano", 7, memory_budget=4)
+    facts = RunKey("framesamp_modul-every_8-grid_1", "nano", 7, memory_budget=4)
     assert default_output(facts) == Path("outputs/evaluation/nano/seed7")
     earlier = Path("outputs/evaluation/framesamp_modul-every_8-grid_1-4/nano/seed7")
     earlier.mkdir(parents=True)
     assert default_output(facts) == earlier
-    trained = RunFacts("framesamp_modul", 80000, 7)
+    trained = RunKey("framesamp_modul", 80000, 7)
     assert default_output(trained) == Path("outputs/evaluation/framesamp_modul/80000/seed7")

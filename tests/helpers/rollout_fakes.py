@@ -14,17 +14,17 @@ import pytest
 
 from helpers.scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout import evaluation
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
 from mme_vla.evaluation.rollout.evaluation import Evaluation, EvaluationRun, RunOptions
-from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import SMALL_VISION, small_policy
 
-FACTS = RunFacts("tiny", "untrained", 42, max_steps=24)
+FACTS = RunKey("tiny", "untrained", 42)
 JOBS = [
     Job(task, "test", episode) for task in ("PickXtimes", "VideoUnmask") for episode in range(3)
 ]

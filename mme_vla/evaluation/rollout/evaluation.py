@@ -16,11 +16,19 @@ from mme_vla.envs.make import ROBOMME, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, counted
 from mme_vla.evaluation.receipts import receipt
-from mme_vla.evaluation.records import EpisodeRecord, RecordLog, finished, merge, read_records
+from mme_vla.evaluation.records import (
+    EpisodeRecord,
+    RecordLog,
+    RunKey,
+    checkpoint_number,
+    finished,
+    merge,
+    read_records,
+)
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
-from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
+from mme_vla.evaluation.rollout.runner import Rollout, Waiting, Workload
 from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
@@ -269,7 +277,7 @@ def facts_of(
     source: str | None,
     settings: RolloutSettings,
     subgoal: str | None,
-) -> RunFacts:
+) -> RunKey:
     """What the records of a run have in common.
 
     name: of the model; None for the policy's own.
@@ -277,12 +285,11 @@ def facts_of(
     subgoal: name of the predictor.
     """
     identity = policy.info.identity or identify_policy(policy, name, source)
-    return RunFacts(
+    return RunKey(
         model=name or identity.model,
         checkpoint=identity.checkpoint,
         model_seed=settings.seed,
         split=settings.split,
-        max_steps=settings.step_limit,
         subgoal=subgoal,
         memory_budget=identity.memory_budget,
         composition=identity.composition,
@@ -291,7 +298,7 @@ def facts_of(
     )
 
 
-def default_output(facts: RunFacts) -> Path:
+def default_output(facts: RunKey) -> Path:
     """A folder that the same command finds again:
     `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`, or `outputs/evaluation/nano/seed<seed>…`
     of a shipped policy. A run that earlier versions began under its model's name continues there.
@@ -305,7 +312,7 @@ def default_output(facts: RunFacts) -> Path:
     if facts.split != "test":
         run += f"-{re.sub('[:=]', '-', facts.split)}"
     folder = Path("outputs", "evaluation", model, str(facts.checkpoint), run)
-    if facts.run.is_shipped and not folder.exists():
+    if facts.is_shipped and not folder.exists():
         folder = Path("outputs", "evaluation", str(facts.checkpoint), run)
     return folder
 
@@ -323,7 +330,7 @@ class EvaluationRun:
     policy: Policy
     jobs: Sequence[Job]
     folder: Path
-    facts: RunFacts
+    facts: RunKey
     settings: RolloutSettings
     options: RunOptions = RunOptions()
 
@@ -345,7 +352,7 @@ class EvaluationRun:
             arm = replace(
                 self,
                 folder=self.folder / ("event-" + re.sub(r"[^\w.+-]", "-", event)),
-                facts=replace(self.facts, event=event),
+                facts=self.facts._replace(event=event),
                 settings=replace(self.settings, event=event),
                 options=options,
             )
@@ -383,7 +390,7 @@ class EvaluationRun:
             workers = min(workers, self.policy.info.max_running or workers)
 
             completed = [record for record in done if record.outcome != "error"]
-            name = options.name or self.facts.run.label
+            name = options.name or self.facts.label
             with RolloutProgress(
                 len(self.jobs), completed, options.show_progress, name
             ) as progress:
@@ -414,7 +421,9 @@ class EvaluationRun:
                     record = replace(record, composition=self.facts.composition)
                 records.append(record)
         merged = merge(records, "first")
-        return [record for record in merged if record.run == self.facts.run and record.key in keys]
+        # Records have the checkpoint as a number where its name is one.
+        run = self.facts._replace(checkpoint=checkpoint_number(self.facts.checkpoint))
+        return [record for record in merged if record.run == run and record.key in keys]
 
     def _roll_out(
         self,
@@ -464,7 +473,7 @@ class EvaluationRun:
             base=base,
             max_steps=settings.limit_of,
             videos=videos,
-            run=self.facts.run.label,
+            run=self.facts.label,
             robot=self.policy.embodiment,
             max_actions=settings.max_actions or info.max_actions,
         )
@@ -489,7 +498,7 @@ def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
 
 def run_settings(
     policy: Policy,
-    facts: RunFacts,
+    facts: RunKey,
     settings: RolloutSettings,
     subgoals: SubgoalPredictor | None = None,
     source: str | None = None,

@@ -14,11 +14,10 @@ from typing import Protocol
 import numpy as np
 
 from mme_vla.envs.base import environment
-from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError, place_of, text_of
-from mme_vla.evaluation.records import EpisodeRecord, OfRun
+from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import ChunkCommand
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
@@ -28,7 +27,6 @@ from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy, frames_a_piece
 from mme_vla.policy.episode import Failure
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
-from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.subgoal import SubgoalPredictor
 
 
@@ -78,22 +76,6 @@ class Environments(Protocol):
     def recv(self, timeout: float | None = None) -> list[Reply]: ...
 
 
-@dataclass(frozen=True)
-class RunFacts(OfRun):
-    """What all records of a run have in common; the fields are those of `EpisodeRecord`."""
-
-    model: str
-    checkpoint: int | str
-    model_seed: int
-    split: str = "test"
-    max_steps: int = DEFAULT_STEPS
-    subgoal: str | None = None
-    memory_budget: int | None = None
-    composition: str | None = None
-    training: TrainingIdentity | None = None
-    event: str | None = None
-
-
 @dataclass
 class Workload:
     """What the policy did, over a whole rollout."""
@@ -134,7 +116,7 @@ class Rollout:
         self,
         policy: Policy,
         envs: Environments,
-        facts: RunFacts,
+        facts: RunKey,
         settings: RolloutSettings,
         record: Callable[[EpisodeRecord], None],
         subgoals: SubgoalPredictor | None = None,
@@ -405,9 +387,9 @@ class Rollout:
         source = environment(self.settings.env)
         spec = source.episode(job.task, job.split, job.episode)
         failed = ending.outcome == "error"
-        facts = {**vars(self.facts), "max_steps": self.settings.limit_of(job.task)}
         return EpisodeRecord(
-            **facts,
+            **self.facts._asdict(),
+            max_steps=self.settings.limit_of(job.task),
             action_space=robot.action.answers or robot.name,
             task=job.task,
             episode=job.episode,

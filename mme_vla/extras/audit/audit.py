@@ -12,8 +12,8 @@ import numpy as np
 from mme_vla.config.sections import Positive, Range
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
+from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.audit.conclusion import (
     INTERVENTIONS,
@@ -79,7 +79,7 @@ def run_audit(
     policy: Policy,
     jobs: Sequence[Job],
     folder: Path,
-    facts: RunFacts,
+    facts: RunKey,
     settings: RolloutSettings,
     options: RunOptions,
     audit: AuditSettings = AuditSettings(),
@@ -116,14 +116,7 @@ def run_audit(
         if why is None:
             # The scenes with chunks that are taken at random.
             floor = RandomPolicy(policy, plan.lend).eval()
-            of_floor = RunFacts(
-                RANDOM,
-                "untrained",
-                settings.seed,
-                facts.split,
-                facts.max_steps,
-                event=facts.event,
-            )
+            of_floor = RunKey(RANDOM, "untrained", settings.seed, facts.split, event=facts.event)
             quiet = replace(options, source=None, name=RANDOM, show_forecast=False)
             EvaluationRun(floor, plan.jobs, folder / RANDOM, of_floor, settings, quiet).run()
             references[RANDOM] = str(folder / RANDOM)

@@ -258,7 +258,7 @@ def run_checkpoint(
         }
     )
     facts = facts_of(policy, None, str(checkpoint), settings, None if subgoals is None else ORACLE)
-    facts = replace(facts, checkpoint=checkpoint.name)
+    facts = facts._replace(checkpoint=checkpoint.name)
     if oracle:
         arm = read_arm(ORACLE)
         why = lacking(arm, policy, channel_of(policy), 0, boundaries=True)
@@ -267,7 +267,7 @@ def run_checkpoint(
             f"oracle={facts.model}: it needs {why}. Name another model, or set oracle=null.",
         )
         policy = ProbedPolicy(policy, arm).eval()
-        facts = replace(facts, model=named(facts.model, arm))
+        facts = facts._replace(model=named(facts.model, arm))
     jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     options = RunOptions(subgoals=subgoals, shard=choose_shard(rules.shard), source=str(checkpoint))
     return EvaluationRun(policy, jobs, folder, facts, settings, options).run().records

@@ -13,9 +13,9 @@ from mme_vla.embodiment.robomme import SIDE, benchmark_action
 from mme_vla.envs.base import CHOICES, environment
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
+from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.rollout.environment import OPTIONS, Frames, Report
 from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.play.game import ChoiceSession
@@ -103,7 +103,7 @@ class PolicyPlayer(Player):
 
 def load_player(
     cfg: DictConfig, max_steps: int, max_choices: int | None
-) -> tuple[PolicyPlayer, RunFacts, dict[str, Any]]:
+) -> tuple[PolicyPlayer, RunKey, dict[str, Any]]:
     """The policy of `checkpoint=…` or `server=…` as a player, what its records say of it, and what
     decides its choices.
     """

@@ -14,7 +14,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.pairing import pair
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, display_name
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, display_name
 from mme_vla.evaluation.results.baselines import is_standing, memory_of
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol, counted
@@ -26,7 +26,6 @@ from mme_vla.evaluation.results.statistics import (
 )
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.extras.probing import lines
@@ -170,7 +169,7 @@ def run_card(
     policy: Policy,
     plan: ProbePlan,
     folder: Path,
-    facts: RunFacts,
+    facts: RunKey,
     settings: RolloutSettings,
     options: RunOptions,
     references: Mapping[str, str] | None = None,
@@ -190,7 +189,7 @@ def measure_card(
     policy: Policy,
     plan: ProbePlan,
     folder: Path,
-    facts: RunFacts,
+    facts: RunKey,
     settings: RolloutSettings,
     options: RunOptions,
     references: Mapping[str, str] | None = None,
@@ -229,7 +228,7 @@ def measure_card(
     plan = replace(plan, arms=list(possible.values()), events=())
     run_probe(policy, replace(plan, recordings=()), folder, facts, settings, options)
     again = replace(settings, seed=settings.seed + 1)
-    renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
+    renamed = facts._replace(model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
     EvaluationRun(policy, plan.jobs, folder / AGAIN, renamed, again, options).run()
 
     # On recorded episodes: how long a wrong scene has an effect.

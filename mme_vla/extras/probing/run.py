@@ -16,7 +16,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, printable, require
-from mme_vla.evaluation.records import ARM, EpisodeRecord, display_name
+from mme_vla.evaluation.records import ARM, EpisodeRecord, RunKey, display_name
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.events import idle_events
@@ -30,7 +30,6 @@ from mme_vla.evaluation.rollout.evaluation import (
     predictor_of,
 )
 from mme_vla.evaluation.rollout.events import event_arms
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RUN_FILE, claim_run, find_records, fingerprint, read_folders
 from mme_vla.extras.probing import lines
@@ -93,7 +92,7 @@ def run_probe(
     policy: Policy,
     plan: ProbePlan,
     folder: Path,
-    facts: RunFacts,
+    facts: RunKey,
     settings: RolloutSettings,
     options: RunOptions,
 ) -> Probe:
@@ -157,7 +156,7 @@ def _in_closed_loop(
     arms: Sequence[Arm],
     plan: ProbePlan,
     folder: Path,
-    facts: RunFacts,
+    facts: RunKey,
     settings: RolloutSettings,
     options: RunOptions,
 ) -> None:
@@ -180,7 +179,7 @@ def _in_closed_loop(
             run.run_with_events(plan.events)
         else:
             probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
-            arm_facts = replace(facts, model=named(facts.model, arm))
+            arm_facts = facts._replace(model=named(facts.model, arm))
             EvaluationRun(probed, plan.jobs, output, arm_facts, settings, arm_options).run()
 
 
@@ -189,7 +188,7 @@ def _on_recordings(
     arms: Sequence[Arm],
     plan: ProbePlan,
     folder: Path,
-    facts: RunFacts,
+    facts: RunKey,
     options: RunOptions,
 ) -> None:
     policy.require_processor().require_stats()

@@ -29,6 +29,7 @@ from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.robomme.recording.frames import motions_of
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError, require, text_of
+from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, mean_interval
 from mme_vla.evaluation.results.tables import Table, to_markdown
@@ -39,7 +40,6 @@ from mme_vla.evaluation.rollout.environment import (
     make_rollout_env,
 )
 from mme_vla.evaluation.rollout.evaluation import RunOptions, run_settings
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import claim_run
@@ -372,7 +372,7 @@ def run_twins(
     policy: Policy,
     jobs: Sequence[Job],
     folder: Path,
-    facts: RunFacts,
+    facts: RunKey,
     settings: RolloutSettings,
     options: RunOptions,
 ) -> Twins:

@@ -17,9 +17,10 @@ from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.config.sections import read_section
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
+from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.rollout.environment import Report, base_env, make_rollout_env
 from mme_vla.evaluation.rollout.local import LocalEnvs
-from mme_vla.evaluation.rollout.runner import Ending, Rollout, RunFacts
+from mme_vla.evaluation.rollout.runner import Ending, Rollout
 from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.trajectories.choice import ChoiceHead
@@ -292,7 +293,7 @@ class _Collector(Rollout):
         keep: Sequence[str],
         oracle_share: float,
     ) -> None:
-        facts = RunFacts("rollouts", "rollouts", settings.seed, settings.split, settings.step_limit)
+        facts = RunKey("rollouts", "rollouts", settings.seed, settings.split)
         super().__init__(policy, envs, facts, settings, record=lambda record: None)
         self.keep, self.oracle_share = keep, oracle_share
         self.finished: list[Trajectory] = []

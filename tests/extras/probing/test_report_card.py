@@ -334,14 +334,13 @@ def test_a_card_runs_every_arm_and_resumes(tmp_path: Path, monkeypatch: pytest.M
     policy, donors = reader(CONTENT), recordings()
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     settings = RolloutSettings(max_steps=16, flow_steps=2, workers=1, max_batch=1)
-    facts = replace(FACTS, max_steps=settings.step_limit)
     options = RunOptions(base=make_choice_env, show_progress=False)
-    card = run_card(policy, plan, tmp_path, facts, settings, options)
+    card = run_card(policy, plan, tmp_path, FACTS, settings, options)
     assert set(card.arms) == set(ARMS) - {"oracle frames"} and "oracle frames" in card.notes[0]
     assert card.recovery is not None and card.recovery.recordings == 1
     assert verify(tmp_path / "again" / "receipt.json")[0] == []
     references = {"floor": str(tmp_path / "online" / "drop-all")}
-    again = run_card(policy, plan, tmp_path, facts, settings, options, references)
+    again = run_card(policy, plan, tmp_path, FACTS, settings, options, references)
     assert again.arms == card.arms
     assert again.references == {"floor": card.arms["nothing remembered"].success}
 

@@ -18,8 +18,8 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError, UserError
+from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.rollout.evaluation import RunOptions
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import UNPROBED
 from mme_vla.extras.probing.settings import ProbeChoice
@@ -44,7 +44,7 @@ from mme_vla.testing.small import small_policy
 
 REPOSITORY = Path(__file__).parents[3]
 SILENT = RunOptions(show_progress=False)
-FACTS = RunFacts("planted", "none", 7)
+FACTS = RunKey("planted", "none", 7)
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 

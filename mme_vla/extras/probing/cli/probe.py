@@ -90,7 +90,7 @@ def probe(cfg: DictConfig) -> None:
         kind = "twins"
     model = safe_name(name, "the policy's name")
     folder = Path("outputs", kind, model, str(facts.checkpoint))
-    if facts.run.is_shipped and not folder.exists():
+    if facts.is_shipped and not folder.exists():
         folder = Path("outputs", kind, str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
