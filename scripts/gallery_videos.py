@@ -12,16 +12,25 @@ import argparse
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from mme_vla.cli.gallery import Snapshot, demonstrated
 from mme_vla.envs.episodes import choose_episodes
 from mme_vla.utils import write_atomically
-from mme_vla.utils.media import bordered, evenly_spaced
+from mme_vla.utils.media import BORDER, RED, evenly_spaced
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "benchmark" / "gallery"
 SIDE, FRAMES, LIMIT = 192, 48, 150_000  # pixels, frames, bytes
 DURATION, LAST = 120, 1500  # milliseconds of a frame, and of the last one
+
+
+def bordered(image: np.ndarray) -> np.ndarray:
+    """The image in a red border: it belongs to a conditioning video."""
+    framed = image.copy()
+    for edge in (np.s_[:BORDER], np.s_[-BORDER:], np.s_[:, :BORDER], np.s_[:, -BORDER:]):
+        framed[edge] = RED
+    return framed
 
 
 def encode(snapshots: list[Snapshot]) -> bytes:

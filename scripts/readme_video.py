@@ -14,13 +14,14 @@ from pathlib import Path
 
 import av
 import numpy as np
+from gallery_videos import bordered
 from PIL import Image, ImageDraw
 
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.scopes import TASK_FACTS
 from mme_vla.evaluation.store import read_records
 from mme_vla.utils import write_atomically
-from mme_vla.utils.media import BORDER, bordered, evenly_spaced, font
+from mme_vla.utils.media import BORDER, evenly_spaced, font
 from mme_vla.utils.style import PALETTE
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "images" / "suites.webp"

@@ -198,26 +198,6 @@ def require_replaceable(path: Path, *suffixes: str) -> Path:
     return path
 
 
-def require_earlier(path: Path, *marks: str) -> Path:
-    """Return where a command is to write a page of a fixed name, if none is there but an earlier
-    one of its own.
-
-    Args:
-        marks: texts that stand in every page of the command.
-
-    Raises:
-        UserError: a file is there in which one of them is missing.
-    """
-    if path.exists() or path.is_symlink():
-        content = read_bytes(path, "a page") if path.is_file() else b""
-        require(
-            all(mark.encode() in content for mark in marks),
-            f"{path} exists, and was not written by this command: it is not replaced. Choose"
-            " another output, or move it away yourself.",
-        )
-    return path
-
-
 _PACKAGE = Path(__file__).parents[1].resolve()  # of the folder: the file itself may be a link
 _HUB_REPOSITORY = re.compile(r"(models|datasets|spaces)--")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")

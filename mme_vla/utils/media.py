@@ -2,7 +2,7 @@
 uint8 throughout.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from io import BytesIO
@@ -117,14 +117,6 @@ def png_bytes(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def bordered(image: np.ndarray) -> np.ndarray:
-    """The image in a red border: it belongs to a conditioning video."""
-    framed = image.copy()
-    for edge in (np.s_[:BORDER], np.s_[-BORDER:], np.s_[:, :BORDER], np.s_[:, -BORDER:]):
-        framed[edge] = RED
-    return framed
-
-
 def video_frame(
     views: Sequence[np.ndarray], caption: str | None = None, video: bool = False
 ) -> np.ndarray:
@@ -161,19 +153,6 @@ def video_frame(
         place = (BORDER, framed_height + CAPTION * number + 2)
         draw.text(place, fitted(line, width, 13), (255, 255, 255), font(13))
     return np.asarray(image)
-
-
-def of_one_size(images: Sequence["Image"]) -> Iterator[np.ndarray]:
-    """Images of any sizes as frames of a video: each at the top left of the largest size."""
-    from PIL import Image
-
-    width = max(image.width for image in images)
-    height = max(image.height for image in images)
-    width, height = width + width % 2, height + height % 2  # as the format wants them
-    for image in images:
-        canvas = Image.new("RGB", (width, height), GROUND)
-        canvas.paste(image)
-        yield np.asarray(canvas)
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,13 @@ from mme_vla.evaluation.results.events import event_curves, event_table
 from mme_vla.evaluation.results.ood import amount_of, twin_table
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.extras.nano.board import Board, homogeneity
 from mme_vla.extras.nano.board_page import notes
 from mme_vla.extras.nano.page import compared
 from mme_vla.extras.nano.rows import read_rows
 from mme_vla.extras.probing import card as card_module
 from mme_vla.extras.probing.run import _paired
+from mme_vla.extras.trajectories.local import LocalEnvs
 
 HERE = ["a0", "a1", "a2", "a3"]
 THERE = ["a0", "b1", "a2", "b3"]

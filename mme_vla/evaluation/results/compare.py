@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import pandas as pd
 
 from mme_vla.errors import counted, require
@@ -15,10 +14,8 @@ from mme_vla.evaluation.results.statistics import (
     Interval,
     bootstrap,
     holm,
-    mean_over_tasks,
     paired_interval,
     sign_test,
-    unpaired_difference,
 )
 
 
@@ -41,7 +38,7 @@ class Comparison:
     repeated, flipped: episodes that were run twice with the same weights and seed, and those of
         them that then ended otherwise; of both methods.
     paired: whether episodes are paired; if not, wins and losses are 0, and interval and p are of
-        the difference of two means (`unpaired_difference`).
+        the difference of two means.
     notes: which episodes were not paired, and which have no digest of their scene; a sentence each.
     gaps: the former.
     """
@@ -219,57 +216,11 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
         first_solved=float(first_rates.mean(axis=1).sum()),
         second_solved=float(second_rates.mean(axis=1).sum()),
     )
-    return _noted(comparison, pairing)
+    what = f"{comparison.first} − {comparison.second}"
+    return replace(comparison, notes=tuple(pairing.notes(what)), gaps=tuple(pairing.gaps(what)))
 
 
 def _score(rates: pd.DataFrame) -> float:
     """The mean over the tasks in percent, rounded: equal counts, equal figures."""
     tasks = rates.groupby(level="task").mean()
     return round(100 * float(tasks.mean(axis=1).mean()), 9)
-
-
-def compare_unpaired(first: Method, second: Method, protocol: Protocol) -> Comparison:
-    """Compare the scores of two methods whose scenes are not known to be the same."""
-    # Each scene is worth the mean of its trainings.
-    first_scenes = by_task(first.rates.mean(axis=1).to_frame())
-    second_scenes = by_task(second.rates.mean(axis=1).to_frame())
-    tasks = [task for task in protocol.averaged if task in first_scenes and task in second_scenes]
-    require(
-        tasks,
-        f"{first.label} and {second.label} have no task in common: there is nothing to compare.",
-    )
-    first_values = [first_scenes[task] for task in tasks]
-    second_values = [second_scenes[task] for task in tasks]
-    first_rate = 100 * mean_over_tasks(first_values)
-    second_rate = 100 * mean_over_tasks(second_values)
-    interval, p = unpaired_difference(first_values, second_values, protocol.confidence)
-    all_solved = [np.ones_like(values) for values in first_values]
-    none_solved = [np.zeros_like(values) for values in second_values]
-    smallest_p = unpaired_difference(all_solved, none_solved, protocol.confidence).p
-    comparison = Comparison(
-        first.label,
-        second.label,
-        min(len(first.rates), len(second.rates)),
-        protocol.count(protocol.averaged),
-        first_rate,
-        second_rate,
-        round(first_rate - second_rate, 9),
-        interval.percent,
-        0,
-        0,
-        p,
-        p,
-        p < 1 - protocol.confidence,
-        {},
-        smallest_p,
-        smallest_p < 1 - protocol.confidence,
-        first.repeated + second.repeated,
-        first.flipped + second.flipped,
-        paired=False,
-    )
-    return _noted(comparison, pair_methods(first, second))
-
-
-def _noted(comparison: Comparison, pairing: Pairing[EpisodeKey]) -> Comparison:
-    what = f"{comparison.first} − {comparison.second}"
-    return replace(comparison, notes=tuple(pairing.notes(what)), gaps=tuple(pairing.gaps(what)))

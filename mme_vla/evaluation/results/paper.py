@@ -3,12 +3,12 @@
 import csv
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.results.scopes import MAX_STEPS, PAPER_ORDER, PAPER_SEEDS, TASK_FACTS
@@ -91,56 +91,12 @@ def mean_over(method: str, tasks: Sequence[str]) -> PaperResult:
     return PaperResult(sum(results[task].mean for task in tasks) / len(tasks))
 
 
-REPLAN = 16  # Frames that pass between two chunks of an episode
-_COUNTED = Path(__file__).resolve().parents[2] / "assets" / "cost.csv"
-
-
-@dataclass(frozen=True)
-class ModelCost:
-    """One model's cost; all but `prompt` (tokens) and `parameters` in FLOPs.
-
-    forward: the loss of one training sample.
-    chunk: memory, prefix and ten Euler steps.
-    memory: of these, encoding the memory tokens from scratch.
-    streamed: instead, a recurrent memory's update by one frame (None for others).
-    frames: the vision tower on those of `REPLAN` passing frames that the memory stores.
-    """
-
-    model: str
-    prompt: int
-    parameters: int
-    forward: int
-    chunk: int
-    memory: int
-    streamed: int | None
-    frames: int
-
-
-@cache
-def counted() -> dict[str, ModelCost]:
-    """The shipped counts of every model at full size, made by `python -m mme_vla.analyse cost`."""
-    costs = {}
-    with _COUNTED.open(newline="") as file:
-        for row in csv.DictReader(file):
-            model = row.pop("model")
-            numbers = {key: int(text) if text else None for key, text in row.items()}
-            costs[model] = ModelCost(model, **numbers)  # type: ignore[arg-type]
-    return costs
-
-
 def chunk_flops() -> dict[str, float]:
-    """FLOPs of a sampled chunk at full size, by model."""
-    return {model: float(cost.chunk) for model, cost in counted().items()}
-
-
-def write_costs(costs: list[ModelCost], path: Path) -> None:
-    """Write counts as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        columns = [member.name for member in fields(ModelCost)]
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(map(asdict, costs))
+    """FLOPs of a sampled chunk at full size, by model, as `python -m mme_vla.analyse cost` counted
+    them.
+    """
+    counts = pd.read_csv(FOLDER.parent / "cost.csv", index_col="model")
+    return counts["chunk"].astype(float).to_dict()
 
 
 CHECKPOINTS = (60_000, 70_000, 79_999)

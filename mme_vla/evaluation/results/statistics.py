@@ -7,7 +7,6 @@ All of them hold for three episodes as well as for 800. Rates are shares (0 to 1
   design effect of survey statistics: Korn and Graubard 1998).
 - A paired difference: the score interval of Tango (1998), at least as wide as the exact interval
   of the sign test (Clopper and Pearson 1934).
-- An unpaired difference: the interval of Agresti and Caffo (2000).
 - A paired test: the exact sign test. Several of them: Holm (1979).
 - Several trainings: a percentile bootstrap (Efron and Tibshirani 1993) over episodes and trainings.
 """
@@ -35,13 +34,6 @@ class Interval(NamedTuple):
     def widen(self, other: "Interval") -> "Interval":
         """The smallest interval that has both in it."""
         return Interval(min(self.low, other.low), max(self.high, other.high))
-
-
-class Difference(NamedTuple):
-    """An interval of a difference, and the p value of no difference."""
-
-    interval: Interval
-    p: float
 
 
 def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
@@ -162,31 +154,6 @@ def tango(gained: float, lost: float, pairs: float, confidence: float = 0.95) ->
     if excess(1.0) > 0:
         high = brentq(excess, difference + 1e-9, 1.0)
     return Interval(float(low), float(high))
-
-
-def unpaired_difference(
-    first: Sequence[np.ndarray], second: Sequence[np.ndarray], confidence: float = 0.95
-) -> Difference:
-    """Interval and p of the difference between two means over the same tasks, of other scenes.
-
-    Each side is counted with two scenes more, one solved and one not (Agresti and Caffo 2000), so
-    that few scenes with equal outcomes are no certainty. p is of the normal approximation that the
-    interval is of.
-
-    first, second: as `effective_trials` takes them.
-    """
-    rates = []
-    variance = 0.0
-    for tasks in (first, second):
-        trials = effective_trials(tasks)
-        rate = (trials * mean_over_tasks(tasks) + 1) / (trials + 2)
-        variance += rate * (1 - rate) / (trials + 2)
-        rates.append(rate)
-    difference = rates[0] - rates[1]
-    deviation = math.sqrt(variance)
-    half = float(norm.ppf(0.5 + confidence / 2)) * deviation
-    p = float(2 * norm.sf(abs(difference) / deviation))
-    return Difference(Interval(max(-1.0, difference - half), min(1.0, difference + half)), p)
 
 
 # Tests --------------------------------------------------------------------------------------------

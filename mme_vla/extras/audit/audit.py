@@ -33,10 +33,10 @@ from mme_vla.extras.probing.card import (
 )
 from mme_vla.extras.probing.interventions import NEEDS
 from mme_vla.extras.probing.recordings import Recording
-from mme_vla.extras.probing.report import ONLINE
+from mme_vla.extras.probing.report import ONLINE, require_earlier
 from mme_vla.extras.probing.run import ProbePlan, run_probe
 from mme_vla.policy.base import Policy
-from mme_vla.utils import read_json, require_earlier, to_json, write_atomically, write_json
+from mme_vla.utils import read_json, to_json, write_atomically, write_json
 
 PAGE, FIGURES, PLAN = "audit.html", "audit.json", "plan.json"
 MARK = "Audit of"  # in the heading of each page

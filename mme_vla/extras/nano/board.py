@@ -23,7 +23,6 @@ from mme_vla.evaluation.results.compare import (
     Comparison,
     compare,
     compare_all,
-    compare_unpaired,
     pair_methods,
 )
 from mme_vla.evaluation.results.paper import PaperMethod
@@ -37,6 +36,7 @@ from mme_vla.evaluation.results.statistics import (
     wilson,
 )
 from mme_vla.extras.nano.rows import CHOICES, Trained, Training
+from mme_vla.extras.nano.unpaired import compare_unpaired
 
 SAMPLES = 2000
 """Of the bootstrap."""

@@ -34,12 +34,12 @@ from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.evidence import record_evidence
 from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import MomentLine
-from mme_vla.extras.probing.report import ONLINE
+from mme_vla.extras.probing.report import ONLINE, require_earlier
 from mme_vla.extras.probing.run import OFFLINE, ProbePlan, run_probe
 from mme_vla.extras.probing.writing import required_frames, score_writing
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.utils import require_earlier, to_json, write_atomically, write_json
+from mme_vla.utils import to_json, write_atomically, write_json
 from mme_vla.utils.pages import escape_markdown
 
 TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"

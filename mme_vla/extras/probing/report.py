@@ -20,7 +20,7 @@ from mme_vla.extras.probing.conclusions import conclude
 from mme_vla.extras.probing.findings import Effect, Findings, by_recording, effect, grouped
 from mme_vla.extras.probing.lines import EntryLine, MomentLine
 from mme_vla.extras.probing.recordings import Recording
-from mme_vla.utils import require_earlier, write_atomically
+from mme_vla.utils import read_bytes, write_atomically
 from mme_vla.utils.media import Tile, contact_sheet
 from mme_vla.utils.pages import render
 from mme_vla.utils.style import COLOURS, FAINT, INK, figure, legend, rgb, svg
@@ -352,6 +352,26 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording, columns: 
 
 
 MARK = "takes from its memory"  # in the heading of each page and table
+
+
+def require_earlier(path: Path, *marks: str) -> Path:
+    """Return where a command is to write a page of a fixed name, if none is there but an earlier
+    one of its own.
+
+    Args:
+        marks: texts that stand in every page of the command.
+
+    Raises:
+        UserError: a file is there in which one of them is missing.
+    """
+    if path.exists() or path.is_symlink():
+        content = read_bytes(path, "a page") if path.is_file() else b""
+        require(
+            all(mark.encode() in content for mark in marks),
+            f"{path} exists, and was not written by this command: it is not replaced. Choose"
+            " another output, or move it away yourself.",
+        )
+    return path
 
 
 def check_outputs(folder: Path, claimed: bool) -> None:

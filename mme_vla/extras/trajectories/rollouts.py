@@ -19,11 +19,11 @@ from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
 from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.rollout.environment import Report, base_env, make_rollout_env
-from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.runner import Ending, Rollout
 from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.trajectories.choice import ChoiceHead
+from mme_vla.extras.trajectories.local import LocalEnvs
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, sample_path
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.base import choose_actions

@@ -25,7 +25,6 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.envs.base import environment
 from mme_vla.evaluation.rollout import evaluation
 from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, facts_of
-from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_records
 from mme_vla.extras.audit import audit as audit_module
@@ -35,6 +34,7 @@ from mme_vla.extras.audit.floor import RANDOM
 from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, measure_card, run_card
 from mme_vla.extras.probing.recordings import Recording, all_recordings
 from mme_vla.extras.probing.run import ProbePlan
+from mme_vla.extras.trajectories.local import LocalEnvs
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy

@@ -25,6 +25,7 @@ from mme_vla.extras.nano.board import Board, Row, homogeneity, kendall, pooled, 
 from mme_vla.extras.nano.cli import board as board_command
 from mme_vla.extras.nano.cli import nano as nano_command
 from mme_vla.extras.nano.rows import read_rows, read_training
+from mme_vla.extras.nano.unpaired import unpaired_difference
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import write_json
 
@@ -678,6 +679,13 @@ def test_a_row_whose_trainings_differ_more_than_others_has_a_wider_interval(tmp_
     board = Board(read_rows([tmp_path]))
     widths = {row.name: np.subtract(*board.interval(row)[::-1]) for row in board.rows}
     assert widths["restless"] > 2 * widths["steady"]
+
+
+def test_few_scenes_with_equal_outcomes_are_no_certainty_unpaired() -> None:
+    interval, p = unpaired_difference([np.ones((3, 1))], [np.zeros((3, 1))])
+    assert interval.low < 0.2 and interval.high == 1.0 and 0.01 < p < 0.05
+    interval, p = unpaired_difference([np.zeros((3, 1))], [np.zeros((3, 1))])
+    assert interval.low < -0.3 and interval.high > 0.3 and p == 1.0
 
 
 def test_the_package_has_the_published_rows() -> None:

@@ -9,7 +9,10 @@ full memory; recurrent memories read a full window. Past frames arrive as stored
 in training; what the vision tower spends on them in an episode is a number of its own.
 """
 
+import csv
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,12 +21,34 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError, counted
-from mme_vla.evaluation.results.paper import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.sections import PolicySections
+
+REPLAN = 16  # frames that pass between two chunks of an episode
+
+
+@dataclass(frozen=True)
+class ModelCost:
+    """One model's cost; all but `prompt` (tokens) and `parameters` in FLOPs.
+
+    forward: the loss of one training sample.
+    chunk: memory, prefix and ten Euler steps.
+    memory: of these, encoding the memory tokens from scratch.
+    streamed: instead, a recurrent memory's update by one frame (None for others).
+    frames: the vision tower on those of `REPLAN` passing frames that the memory stores.
+    """
+
+    model: str
+    prompt: int
+    parameters: int
+    forward: int
+    chunk: int
+    memory: int
+    streamed: int | None
+    frames: int
 
 
 def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
@@ -87,3 +112,13 @@ def on_meta(model: str, budget: int | None = None, backbone: str | None = None) 
     if policy.memory is None:
         raise UserError(f"{model} has no memory, so no budget of {counted(budget, 'token')}.")
     return build_policy(model, backbone=backbone, device="meta", memory={"budget": budget})
+
+
+def write_costs(costs: list[ModelCost], path: Path) -> None:
+    """Write counts as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        columns = [member.name for member in fields(ModelCost)]
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(map(asdict, costs))

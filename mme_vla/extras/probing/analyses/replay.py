@@ -21,6 +21,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import SubgoalText
+from mme_vla.utils.media import GROUND
 from mme_vla.utils.style import COLOURS, FAINT, figure, svg
 
 STRIDE = 16  # Steps between two chunks, as an evaluation executes them
@@ -206,3 +207,14 @@ def selection_sheets(
             step,
             memory_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title),
         )
+
+
+def of_one_size(images: Sequence[Image.Image]) -> Iterator[np.ndarray]:
+    """Images of any sizes as frames of a video: each at the top left of the largest size."""
+    width = max(image.width for image in images)
+    height = max(image.height for image in images)
+    width, height = width + width % 2, height + height % 2  # as the format wants them
+    for image in images:
+        canvas = Image.new("RGB", (width, height), GROUND)
+        canvas.paste(image)
+        yield np.asarray(canvas)

@@ -190,8 +190,8 @@ def _memory(name: str, words: Sequence[str]) -> "Memory":
 def selection(args: argparse.Namespace) -> None:
     """Write what a memory remembers along an episode as an mp4, and its last image as PNG."""
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.extras.probing.analyses.replay import selection_sheets
-    from mme_vla.utils.media import of_one_size, write_video
+    from mme_vla.extras.probing.analyses.replay import of_one_size, selection_sheets
+    from mme_vla.utils.media import write_video
 
     source = EpisodeSource(args.dataset)
     memory = _memory(args.memory, args.set)
@@ -216,8 +216,8 @@ def cost(args: argparse.Namespace) -> None:
     """Count models at full size; with --budgets, over the memory budget beside the
     paper's success.
     """
-    from mme_vla.evaluation.results.paper import paper_table, write_costs
-    from mme_vla.extras.probing.analyses.cost import count_model
+    from mme_vla.evaluation.results.paper import paper_table
+    from mme_vla.extras.probing.analyses.cost import count_model, write_costs
 
     known = list(library_files("model"))
     models = known
