@@ -6,7 +6,8 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial, partialmethod
+from functools import partialmethod
+from typing import Self
 
 
 @contextmanager
@@ -39,6 +40,61 @@ LINE_SECONDS = 20.0
 """Without a terminal: how long a log stays silent at most while steps are being finished."""
 
 
+class Bar:
+    """A bar on a terminal, with a text beside it that changes; anywhere else only lines. A context
+    manager.
+
+    total, done: steps, and those of them that were finished before.
+    visible: False prints nothing.
+    stderr: where it is printed; False for stdout.
+    """
+
+    def __init__(
+        self, total: int, done: int = 0, text: str = "", visible: bool = True, stderr: bool = True
+    ) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        self.total = total
+        self.visible = visible
+        self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=stderr)
+        self.bar: Progress | None = None
+        # FORCE_COLOR makes the first true, in notebooks too
+        if self.console.is_terminal and self.console.file.isatty() and visible:
+            columns = (
+                BarColumn(24),
+                MofNCompleteColumn(),
+                TextColumn("{task.description}", markup=False),
+                TimeRemainingColumn(),
+            )
+            self.bar = Progress(*columns, console=self.console)
+            self._task = self.bar.add_task(text, total=total, completed=done)
+
+    def __enter__(self) -> Self:
+        if self.bar is not None:
+            self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+
+    def advance(self, steps: int = 1, text: str | None = None) -> None:
+        """Count finished steps, and replace the text; without a terminal, nothing."""
+        if self.bar is not None:
+            self.bar.update(self._task, advance=steps, description=text)
+
+    def say(self, text: str) -> None:
+        """Print a line that stays."""
+        self.console.print(text, markup=False)
+
+
 @contextmanager
 def progress(
     description: str, total: int, done: int = 0, unit: str = ""
@@ -51,20 +107,12 @@ def progress(
     Where no terminal is, a line says what is finished: at most one every `LINE_SECONDS`, and one
     after the last step.
     """
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     if total == 1:
         unit = unit.removesuffix("s")
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    if not (console.is_terminal and console.file.isatty()):
-        # FORCE_COLOR makes the first true, in notebooks too
+    with Bar(total, done, f"{unit} · {description}" if unit else description) as bar:
+        if bar.bar is not None:
+            yield bar.advance
+            return
         begun = reported = time.monotonic()
         count = done
         # Time and count after the first steps, which also took what was needed to start.
@@ -84,20 +132,9 @@ def progress(
                 seconds = (now - first[0]) / n_new * (total - count)
                 remaining = f", about {_duration_text(seconds)} left"
             counted = f"{count:,} of {total:,} {unit}".rstrip()
-            console.print(f"{description}: {counted} in {_duration_text(now - begun)}{remaining}")
+            bar.say(f"{description}: {counted} in {_duration_text(now - begun)}{remaining}")
 
         yield count_up
-        return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(unit),
-    )
-    with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
-        task = bar.add_task(description, total=total, completed=done)
-
-        yield partial(bar.advance, task)
 
 
 def _duration_text(seconds: float) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, Any, Literal, Self
+from typing import IO, Any, Literal
 
 import numpy as np
 import torch
@@ -24,10 +24,9 @@ from accelerate.tracking import (
     WandBTracker,
 )
 from PIL import Image
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
+from mme_vla.data.console import Bar
 from mme_vla.errors import CONSTRAINTS, UserError, missing_extra, require
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
@@ -104,38 +103,13 @@ class Window:
         return values
 
 
-class ProgressLine:
+class ProgressLine(Bar):
     """Shows the step and the latest numbers. Without a terminal it prints a line whenever numbers
     arrive.
     """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
-        self.visible = visible
-        self.console = Console(quiet=not visible, highlight=False, soft_wrap=True)
-        self._total = total
-        self._bar: Progress | None = None
-        if self.console.is_terminal and self.console.file.isatty() and visible:
-            columns = (
-                BarColumn(24),
-                MofNCompleteColumn(),
-                TextColumn("{task.description}"),
-                TimeRemainingColumn(),
-            )
-            self._bar = Progress(*columns, console=self.console, transient=True)
-            self._task = self._bar.add_task("starting", total=total, completed=done)
-
-    def __enter__(self) -> Self:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def advance(self) -> None:
-        if self._bar is not None:
-            self._bar.advance(self._task)
+        super().__init__(total, done, "starting", visible, stderr=False)
 
     def numbers(self, step: int, values: Mapping[str, float]) -> None:
         text = (
@@ -143,13 +117,9 @@ class ProgressLine:
             f" {values['train/grad_norm']:.2f} · {values['speed/samples_per_s']:.1f} samples/s ·"
             f" {values['memory/gib']:.1f} GiB"
         )
-        if self._bar is not None:
-            self._bar.update(self._task, description=text)
-        else:
-            self.console.print(f"step {step}/{self._total} · {text}", markup=False)
-
-    def say(self, text: str) -> None:
-        self.console.print(text, markup=False)
+        self.advance(0, text)
+        if self.bar is None:
+            self.say(f"step {step}/{self.total} · {text}")
 
 
 def resident_gib() -> float:

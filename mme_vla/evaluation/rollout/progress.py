@@ -8,27 +8,16 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
+from mme_vla.data.console import Bar
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, counted, printable
 from mme_vla.evaluation.records import EpisodeRecord, read_records
 from mme_vla.evaluation.store import find_records
 
 
-class RolloutProgress:
-    """A bar on a terminal; anywhere else the lines alone. A context manager.
+class RolloutProgress(Bar):
+    """A line an episode, and the success so far: beside a bar on a terminal, else in the line.
 
     total: episodes of this process.
     before: records of those that an earlier run has finished.
@@ -42,31 +31,9 @@ class RolloutProgress:
         visible: bool = True,
         name: str = "",
     ) -> None:
-        self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=True)
-        self.total = total
         self._prefix = f"{printable(name)}: " if name else ""
         self._outcomes = Counter(record.outcome for record in before)
-        self._bar: Progress | None = None
-        if self.console.is_terminal and self.console.file.isatty() and visible:
-            columns = (
-                BarColumn(24),
-                MofNCompleteColumn(),
-                TextColumn("{task.description}"),
-                TimeElapsedColumn(),
-                TextColumn("left"),
-                TimeRemainingColumn(),
-            )
-            self._bar = Progress(*columns, console=self.console)
-            self._task = self._bar.add_task(self._description, total=total, completed=self.done)
-
-    def __enter__(self) -> Self:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        super().__init__(total, self.done, self._prefix + self.summary, visible)
 
     @property
     def done(self) -> int:
@@ -85,20 +52,17 @@ class RolloutProgress:
             text += f" · {errors} errors"
         return text
 
-    @property
-    def _description(self) -> str:
-        return escape(self._prefix) + self.summary
-
     def episode(self, record: EpisodeRecord, again: bool = False) -> None:
         """One episode ended; `again` if it will be tried once more, and does not count yet."""
         if not again:
             self._outcomes[record.outcome] += 1
+            self.advance(1, self._prefix + self.summary)
         seconds = record.seconds
         episode = f"{record.task} {record.episode}"
         if record.difficulty:
             episode += f" ({record.difficulty})"
         line = (
-            f"{self._prefix}{episode}: {record.outcome}, {counted(record.steps, 'step')} in"
+            f"{episode}: {record.outcome}, {counted(record.steps, 'step')} in"
             f" {seconds.total:.0f} s (simulation {seconds.sim:.0f},"
             f" rendering {seconds.render:.0f}, policy {seconds.policy:.0f})"
         )
@@ -106,15 +70,13 @@ class RolloutProgress:
             line += f": {record.error}"
         if again:
             line += " · tried again"
-        if self._bar is not None:
-            self._bar.update(self._task, description=self._description, completed=self.done)
-            self._bar.console.print(line, markup=False)
-        else:
-            self.console.print(f"{line} · {self.done}/{self.total}, {self.summary}", markup=False)
+        if self.bar is None:
+            line += f" · {self.done}/{self.total}, {self.summary}"
+        self.say(line)
 
     def say(self, text: str) -> None:
         """Print a line that stays."""
-        self.console.print(f"{self._prefix}{text}", markup=False)
+        super().say(f"{self._prefix}{text}")
 
 
 def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:
