@@ -290,25 +290,28 @@ def show_checkpoint(
     folder = resolve_checkpoint(folder)
     policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)
     console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
+    state = read_state(folder) if (folder / STATE).is_file() else None
     grid = Table.grid(padding=(0, 2))
-    for row in summary_rows(policy, folder):
+    for row in [*summary_rows(policy), *training_rows(policy, folder, state)]:
         grid.add_row(*map(printable, row))
     console.print(grid, highlight=False)
     if everything:
-        show_details(policy, folder, console)
+        show_details(policy, state, console)
     else:
         console.print("all=true shows the whole configuration and the statistics", style="dim")
 
 
-def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
-    """What a checkpoint is, a title and a text each."""
+def summary_rows(policy: Policy) -> list[tuple[str, str]]:
+    """What a policy is, a title and a text each."""
     sections = PolicySections.of(policy.config)
     robot = policy.embodiment
     space = robot.action
     parts: dict[str, int] = {}
+    dtypes: dict[str, None] = {}  # in order, each once
     for name, parameter in policy.named_parameters():
         part = policy.finetune_spec.component_of(name)
         parts[part] = parts.get(part, 0) + parameter.numel()
+        dtypes[str(parameter.dtype).removeprefix("torch.")] = None
     sizes = ", ".join(f"{part} {count:,}" for part, count in parts.items())
     names = [str(sections.name or "policy"), str(sections.backbone.get("name", "pi05"))]
     rate = "any rate" if robot.fps is None else f"{robot.fps:g} frames per second"
@@ -322,9 +325,9 @@ def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
         parts_of.append(f"of the camera {robot.memory_camera}")
         parts_of.append(f"integration {sections.integration.get('name', 'none')}")
         memory = ", ".join(parts_of)
-    rows = [
+    return [
         ("model", f"{names[0]}, backbone {names[1]} ({type(policy).__name__})"),
-        ("parameters", f"{sum(parts.values()):,}: {sizes}"),
+        ("parameters", f"{sum(parts.values()):,} ({', '.join(dtypes)}): {sizes}"),
         ("robot", f"{robot.name}: cameras {', '.join(robot.camera_names)}, {rate}"),
         ("state", counted(robot.state.width, "number")),
         ("action", f"{counted(space.width, 'number')}, {relative}"),
@@ -332,16 +335,19 @@ def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
         ("memory", memory),
         ("text", policy.require_processor().prompt_spec.encoder),
     ]
-    return rows + training_rows(folder, sections)
 
 
-def training_rows(folder: Path, sections: PolicySections) -> list[tuple[str, str]]:
-    """What is known of a checkpoint's training: data, steps, and errors."""
-    card = sections.card
+def training_rows(
+    policy: Policy, folder: Path, state: Mapping[str, Any] | None
+) -> list[tuple[str, str]]:
+    """What is known of a checkpoint's training: data, steps, and errors.
+
+    state: of the training, where the checkpoint has it.
+    """
+    card = PolicySections.of(policy.config).card
     known = str(card.get("data") or "not recorded")
     steps = _summary(card.get("recipe") or "not recorded")
-    if (folder / STATE).is_file():
-        state = read_state(folder)
+    if state is not None:
         data = state["config"].get("data", {})
         train = state["config"].get("train", {})
         known = ", ".join(entry.short_name for entry in listed_sources(data.get("sources")))
@@ -375,26 +381,12 @@ def _open_loop_of(folder: Path) -> Mapping[str, Any] | None:
     return check
 
 
-def show_details(policy: Policy, folder: Path, console: Console) -> None:
-    """Print a checkpoint's parts, whole configuration, training state and statistics."""
-    table = _table("parts", "part", "tensors", "parameters", "dtype")
-    parts: dict[str, list[Any]] = {}
-    for name, parameter in policy.named_parameters():
-        parts.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
-    for part, tensors in parts.items():
-        dtypes = sorted({str(t.dtype).removeprefix("torch.") for t in tensors})
-        count = sum(t.numel() for t in tensors)
-        table.add_row(part, str(len(tensors)), f"{count:,}", ", ".join(dtypes))
-    total = list(policy.parameters())
-    count = sum(t.numel() for t in total)
-    table.add_row("all", str(len(total)), f"{count:,}", "", style="bold")
-    _show(table, console)
+def show_details(policy: Policy, state: Mapping[str, Any] | None, console: Console) -> None:
+    """Print a checkpoint's whole configuration, training state and statistics."""
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
         settings.add_row(name, _summary(section))
-    settings.add_row("words", printable(policy.require_processor().prompt_spec.encoder))
-    if (folder / STATE).is_file():
-        state = read_state(folder)
+    if state is not None:
         settings.add_row(
             "trained for",
             f"{counted(state['step'], 'step')}; weights here are averages, raw ones beside them",
