@@ -3,9 +3,7 @@ them the goal, the run, the step, the subgoal and at the end the outcome.
 """
 
 import re
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +11,12 @@ import numpy as np
 from mme_vla.utils import draft_of
 from mme_vla.utils.media import VideoWriter, video_frame
 
-BEHIND = 64  # Frames that may wait to be compressed
 _LONGEST_GOAL = 100  # characters of a file name
 
 
 class EpisodeVideo:
     """Draws and compresses frame by frame, so that no episode is held in memory.
 
-    A thread compresses beside the simulation, which waits only when it is `BEHIND` frames ahead.
     The file gets its name, with the outcome, when the episode is over; until then it is a hidden
     file beside it.
 
@@ -37,8 +33,6 @@ class EpisodeVideo:
         self._run = run
         self._video: VideoWriter | None = None
         self._draft = Path()
-        self._thread: ThreadPoolExecutor | None = None
-        self._waiting: deque[Future[None]] = deque()
 
     def add(
         self,
@@ -59,11 +53,7 @@ class EpisodeVideo:
             folder.mkdir(parents=True, exist_ok=True)
             self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
             self._video = VideoWriter(self._draft)
-            self._thread = ThreadPoolExecutor(1, "video")
-        assert self._thread is not None
-        self._waiting.append(self._thread.submit(self._video.add, video_frame(views, text, demo)))
-        while len(self._waiting) > BEHIND:
-            self._waiting.popleft().result()
+        self._video.add(video_frame(views, text, demo))
 
     def finish(self, outcome: str, goal: str) -> Path | None:
         """Close the video under its name; None if this outcome is not kept."""
@@ -71,7 +61,6 @@ class EpisodeVideo:
         if self._video is None or self._save_on not in ("all", kind):
             self.discard()
             return None
-        self._compressed()
         self._video.close()
         target = self._path(outcome, goal)
         self._draft.replace(target)
@@ -81,23 +70,9 @@ class EpisodeVideo:
     def discard(self) -> None:
         """Drop the frames."""
         if self._video is not None:
-            for frame in self._waiting:
-                frame.cancel()
-            self._compressed(complete=False)
             self._video.close(complete=False)
             self._draft.unlink(missing_ok=True)
             self._video = None
-
-    def _compressed(self, complete: bool = True) -> None:
-        """Wait for the thread; with `complete`, what went wrong in it is raised."""
-        if self._thread is not None:
-            self._thread.shutdown()
-            self._thread = None
-        waiting = self._waiting
-        self._waiting = deque()
-        if complete:
-            for frame in waiting:
-                frame.result()
 
 
 def video_name(task: str, episode: int, outcome: str, goal: str) -> str:
