@@ -64,6 +64,8 @@ count: repetitions or visits more. containers: more, over nothing. swaps: more o
 more between what is shown and the execution. path: discs more on the way. distractors: more objects
 that are not targets.
 """
+SESSIONS = "sessions"
+"""A dial of records of an earlier version: unrelated episodes before each."""
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 HARD, CHALLENGE = "hard", "challenge"
 """The test split's hard episodes (its numbers 3, 7, …, 47), and the held-out scenes of the 2026
@@ -113,6 +115,12 @@ class Variant:
             f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is"
             " none.",
         )
+        require(
+            self.dial != SESSIONS,
+            f"split={STRESS}:{SESSIONS}: episodes before each change no scene, so no split has"
+            " them: `mme-vla probe online=true recordings=<dataset>"
+            f" with=distract:{self.turned}` shows them.",
+        )
         if self.dial:
             dials = [dial for dial, tasks in DIALS.items() if task in tasks]
             require(
@@ -139,12 +147,7 @@ def read_variant(split: str) -> Variant | None:
             f" {', '.join(DIALS)}."
         )
     require(
-        match[1] != "sessions",
-        f"split={split!r}: episodes before each change no scene, so no split has them: `mme-vla"
-        f" probe online=true recordings=<dataset> with=distract:{match[2]}` shows them.",
-    )
-    require(
-        match[1] in DIALS,
+        match[1] in DIALS or match[1] == SESSIONS,
         f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], DIALS)}",
     )
     return Variant(dial=match[1], turned=int(match[2]))

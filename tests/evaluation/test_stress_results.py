@@ -27,6 +27,12 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
     assert mine[0].interval.low < 100 == mine[0].interval.high and len(stress_figures(curves)) == 1
 
 
+def test_records_of_a_former_dial_are_still_drawn() -> None:
+    curves = stress_curves([*records("test", [1, 0]), *records("stress:sessions=2", [0, 0])])
+    (points,) = curves.values()
+    assert [(point.turned, point.won) for point in points] == [(0, 1), (2, 0)]
+
+
 def test_runs_are_drawn_in_the_order_of_their_records() -> None:
     stress_records = [record for run in "zab" for record in records("stress:count=2", [1, 0], run)]
     (figure,) = stress_figures(stress_curves(stress_records)).values()
