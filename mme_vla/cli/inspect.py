@@ -16,7 +16,6 @@ from rich.table import Table
 
 from mme_vla.backbone.building import shape_of
 from mme_vla.cli.loading import words_of
-from mme_vla.config.composition import resolved
 from mme_vla.config.devices import find_device
 from mme_vla.config.sections import PathText, PositiveInt, read_section, without
 from mme_vla.config.trees import library_trees, yaml_files
@@ -36,6 +35,7 @@ from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import policy_config
 from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint, shipped_name
 from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.self_check import NO_CHECK, compare
@@ -87,7 +87,7 @@ def main(cfg: DictConfig) -> None:
 
     With `checkpoint` and `dataset` the policy is checked open loop on an episode.
     """
-    inspection = Inspection.from_config(resolved(cfg))
+    inspection = Inspection.from_config(policy_config(cfg))
     console = Console(markup=False)
     if inspection.check:
         show_self_check(inspection, console)
@@ -151,7 +151,7 @@ def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
     robot and the memory of `checkpoint`.
     """
     assert inspection.checkpoint is not None and inspection.dataset is not None
-    named = words_of("embodiment", "backbone", "memory")
+    named = words_of("embodiment", "env", "backbone", "memory")
     require(
         not named, f"A checkpoint brings its own robot and memory: leave out {' '.join(named)}."
     )

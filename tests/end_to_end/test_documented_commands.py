@@ -49,7 +49,9 @@ NOT_RUN = {
     r"mme-vla audit (checkpoint|server)=": "evaluates for minutes",
     r"served_checkpoint\.py": "serves until it is stopped",
     r"torchrun|accelerate launch|--multirun": "needs several GPUs or a cluster",
-    r"env[= ]mikasa|benchmarks/mikasa": "needs the extra `mikasa`, as tests/extras/mikasa does",
+    r"env[= ]mikasa|benchmarks/mikasa": (
+        "needs the extra `mikasa`; tests/extras/mikasa/test_mikasa_commands.py tries each command"
+    ),
     r"<|…": "has a place for a file or folder of the reader's own",
     r"mme(_vla\.|-vla )train ": "trains for minutes or hours",
     r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from helpers import commands
+from mme_vla.cli.inspect import main as inspect
+from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.base import environment
@@ -99,6 +101,15 @@ def test_a_published_dataset_is_read_as_it_is(
         if camera == "wrist":
             expected = 255 - expected
         np.testing.assert_allclose(brightness, expected, atol=4)
+
+
+def test_inspect_shows_it_as_of_the_robot_of_its_environment(
+    published: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    inspect(compose("inspect", ["env=mikasa", f"dataset={published}"]))
+    printed = capsys.readouterr().out
+    assert f"{sum(LENGTHS)} execution steps to train on · 10 frames per second" in printed
+    assert "7 numbers: x, y, z, roll, pitch, yaw, gripper" in printed and "draft" not in printed
 
 
 def test_a_policy_trains_on_a_published_dataset(published: Path, tmp_path: Path) -> None:

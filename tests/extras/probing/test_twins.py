@@ -1,14 +1,13 @@
 """Twin accuracy: policies whose answer is known, in an environment of one's own and in RoboMME."""
 
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
+from helpers.planted import Planted, PlantedEpisode, Rule
 from mme_vla.config.plugins import import_plugins
 from mme_vla.embodiment.robomme import CHOICE_SPACE, choice_action
 from mme_vla.envs import make
@@ -39,7 +38,6 @@ from mme_vla.extras.probing.twins import (
     share_correct,
     twin_tables,
 )
-from mme_vla.policy.base import Policy
 from mme_vla.testing.small import small_policy
 
 REPOSITORY = Path(__file__).parents[3]
@@ -127,51 +125,6 @@ def blink(monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.syspath_prepend(REPOSITORY / "examples" / "blink")
     import_plugins(["blink_twins"])
     return "blink_twins"
-
-
-class PlantedEpisode:
-    """Keeps every image that it observes, and the noise that the policy would have."""
-
-    failure = None
-    subgoal = None
-    goal = ""
-    options: Sequence[Any] = ()
-
-    def __init__(self, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
-        self.images: list[np.ndarray] = []
-        self.n_observed_frames = 0
-
-    def observe(self, frames: Mapping[str, np.ndarray], *_: Any, **__: Any) -> None:
-        images = next(iter(frames.values()))
-        self.images += list(images)
-        self.n_observed_frames += len(images)
-
-    def note_subtask_starts(self, frames: Sequence[int], exec_start: int) -> None:
-        pass
-
-
-Rule = Callable[[PlantedEpisode], np.ndarray]
-"""The chunk that is chosen in an episode."""
-
-
-class Planted(Policy):
-    """A policy that acts by a rule, with the robot of another."""
-
-    memory = None
-
-    def __init__(self, inner: Policy, rule: Rule) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(1))
-        self.processor = inner.processor
-        self.config = inner.config
-        self.rule = rule
-
-    def start_episode(self, goal: str, seed: int = 0) -> Any:
-        return PlantedEpisode(seed)
-
-    def act(self, episodes: Any, steps: int | None = None) -> np.ndarray:
-        return np.stack([self.rule(episode) for episode in episodes])
 
 
 def move(side: float) -> np.ndarray:
@@ -316,41 +269,3 @@ def test_a_scene_that_cannot_be_built_is_left_out_with_its_reason(
 def test_a_count_of_what_the_robot_does_has_no_twin(task: str) -> None:
     source = environment("mme_vla")
     assert source.twin(source.episode(task, "test", 0)) is None
-
-
-# MIKASA-Robo-VLA ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task", ["RememberColor3", "TakeItBack"])
-def test_only_what_knows_the_fact_is_right_in_both_scenes_of_mikasa(
-    task: str, tmp_path: Path
-) -> None:
-    pytest.importorskip("mikasa_robo_suite", reason="the extra `mikasa` is not installed")
-    made: list[Any] = []
-
-    def base(**scene: Any) -> Any:
-        made.append(environment("mikasa").open(render=False, **scene))
-        return made[-1]
-
-    def towards(number: int | None) -> Rule:
-        """The chunk that moves to a candidate, None for the correct one."""
-
-        def rule(_: PlantedEpisode) -> np.ndarray:
-            candidates, place = made[-1].candidates, made[-1].tool
-            goal = candidates.places[candidates.correct[0] if number is None else number]
-            gap = np.asarray(goal) - place
-            row = np.zeros(7, np.float32)  # of four equal steps, of 0.038 m at most
-            row[:2] = gap / max(float(np.linalg.norm(gap)), 4 * 0.038)
-            return np.tile(row, (4, 1))
-
-        return rule
-
-    options = replace(SILENT, base=base)
-    settings = RolloutSettings(env="mikasa", seed=7)
-    for name, rule, expected in (("knows", towards(None), 1), ("always the first", towards(0), 0)):
-        policy = Planted(small_policy("pi05", env="mikasa"), rule)
-        jobs = [Job(task, "test", episode) for episode in range(2)]
-        twins = run_twins(policy, jobs, tmp_path / name, FACTS, settings, options)
-        accuracy = twins.total[UNPROBED.name]
-        assert (accuracy.pairs, accuracy.accuracy) == (2, expected), twins.notes
-        assert accuracy.chance == pytest.approx(1 / 9)

@@ -1,0 +1,51 @@
+"""Twin accuracy in MIKASA-Robo-VLA of policies whose answer is known."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers.planted import Planted, PlantedEpisode, Rule
+from mme_vla.envs.base import environment
+from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.rollout.evaluation import RunOptions
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.extras.probing.arms import UNPROBED
+from mme_vla.extras.probing.twins import run_twins
+from mme_vla.testing.small import small_policy
+
+
+@pytest.mark.usefixtures("simulator")
+@pytest.mark.parametrize("task", ["RememberColor3", "TakeItBack"])
+def test_only_what_knows_the_fact_is_right_in_both_scenes(task: str, tmp_path: Path) -> None:
+    made: list[Any] = []
+
+    def base(**scene: Any) -> Any:
+        made.append(environment("mikasa").open(render=False, **scene))
+        return made[-1]
+
+    def towards(number: int | None) -> Rule:
+        """The chunk that moves to a candidate, None for the correct one."""
+
+        def rule(_: PlantedEpisode) -> np.ndarray:
+            candidates, place = made[-1].candidates, made[-1].tool
+            goal = candidates.places[candidates.correct[0] if number is None else number]
+            gap = np.asarray(goal) - place
+            row = np.zeros(7, np.float32)  # of four equal steps, of 0.038 m at most
+            row[:2] = gap / max(float(np.linalg.norm(gap)), 4 * 0.038)
+            return np.tile(row, (4, 1))
+
+        return rule
+
+    options = RunOptions(show_progress=False, base=base)
+    settings = RolloutSettings(env="mikasa", seed=7)
+    facts = RunFacts("planted", "none", 7)
+    for name, rule, expected in (("knows", towards(None), 1), ("always the first", towards(0), 0)):
+        policy = Planted(small_policy("pi05", env="mikasa"), rule)
+        jobs = [Job(task, "test", episode) for episode in range(2)]
+        twins = run_twins(policy, jobs, tmp_path / name, facts, settings, options)
+        accuracy = twins.total[UNPROBED.name]
+        assert (accuracy.pairs, accuracy.accuracy) == (2, expected), twins.notes
+        assert accuracy.chance == pytest.approx(1 / 9)
