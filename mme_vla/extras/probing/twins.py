@@ -54,6 +54,10 @@ from mme_vla.utils.io import to_line
 LINES, FIGURES = "twins.jsonl", "twins.json"
 MEMORY_OFF = "drop:all"
 """The arm without memory: everything remembered is removed."""
+SAME_STATE = 0.005
+"""In the units of the state (rad, m): what twins may differ by. Those of one state differ by less
+than 0.0001, and a cube that was brought from another place by 0.03.
+"""
 NOTHING = RenderRequest({}, now=(), grounded=False)
 
 
@@ -86,12 +90,14 @@ class TwinLine:
 class Decision:
     """One scene of a pair at its decision.
 
+    state: of the robot, [w].
     chunks: of each arm the actions [n, w] that are executed next.
     actions: the demonstrator's, which led here.
     """
 
     goal: str
     candidates: Candidates
+    state: np.ndarray
     chunks: Mapping[str, np.ndarray]
     actions: Sequence[np.ndarray]
 
@@ -141,6 +147,12 @@ def check_pair(first: Decision, second: Decision) -> None:
     others = np.asarray(second.candidates.places, np.float64)
     if first.goal != second.goal:
         raise NoPairError("the goal of its twin differs")
+    gap = np.abs(first.state - second.state).max()
+    if gap > SAME_STATE:
+        raise NoPairError(
+            f"the robot's state differs by {gap:.2g} from its twin's, so the current frame may tell"
+            " them apart"
+        )
     if places.shape != others.shape:
         raise NoPairError("its twin has another number of candidates")
     same = _half_gap(places)
@@ -255,7 +267,8 @@ class TwinScenes:
                 if failure is not None:
                     raise NoPairError(f"the policy cannot act: {failure.reason}")
                 chunks[arm] = chunk[:execute]
-            return Decision(str(report.goal), candidates, chunks, actions)
+            state = np.asarray(frames["state"][-1], np.float64)
+            return Decision(str(report.goal), candidates, state, chunks, actions)
         finally:
             env.close()
 

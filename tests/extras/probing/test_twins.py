@@ -66,11 +66,12 @@ def test_a_tie_counts_by_the_share_that_is_correct() -> None:
 
 
 def test_a_pair_differs_in_what_is_correct_alone() -> None:
-    first = Decision("go", Candidates(SQUARE.tolist(), [0]), {}, [])
+    first = Decision("go", Candidates(SQUARE.tolist(), [0]), np.zeros(8), {}, [])
     other = replace(first, candidates=Candidates(SQUARE[::-1].tolist(), [0]))
     check_pair(first, other)
     wrong = {
         "goal": replace(other, goal="stay"),
+        "state differs by 0.01 from": replace(other, state=np.full(8, 0.01)),
         "same candidate": replace(first, candidates=Candidates(SQUARE[::-1].tolist(), [3])),
         "number": replace(first, candidates=Candidates(SQUARE[:3].tolist(), [1])),
         "elsewhere": replace(first, candidates=Candidates((SQUARE + 9).tolist(), [1])),
