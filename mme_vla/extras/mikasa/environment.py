@@ -315,13 +315,13 @@ class MikasaChoices(MikasaVideo):
     @property
     def tasks(self) -> tuple[str, ...]:  # type: ignore[override]
         """Those with something to choose, whose models are on this machine."""
-        return tuple(task for task in super().tasks if facts_of_task(task).has_twin)
+        return tuple(task for task in super().tasks if facts_of_task(task).has_choices)
 
     def check_task(self, task: str) -> None:
         """A task with something to choose, whose models are on this machine."""
         super().check_task(task)
         require(
-            facts_of_task(task).has_twin,
+            facts_of_task(task).has_choices,
             f"{task} has nothing to choose: take env=mikasa, or one of {', '.join(self.tasks)}.",
         )
 

@@ -42,7 +42,9 @@ class SceneFacts:
     """
 
     has_twin: ClassVar[bool] = False
-    """Whether the answer is one of several things: it can be flipped, and chosen."""
+    """Whether the answer can be flipped, and nothing else with it."""
+    has_choices: ClassVar[bool] = False
+    """Whether the answer is one of several things."""
 
     def __init__(self, scene: Any, cue_end: int, by_choice: bool = False) -> None:
         self._scene = scene
@@ -83,6 +85,7 @@ class Recall(SceneFacts):
     """
 
     has_twin = True
+    has_choices = True
 
     @property
     def _things(self) -> Mapping[int, Any]:
@@ -274,9 +277,11 @@ class InOrder(Several):
 
 
 class Origin(SceneFacts):
-    """TakeItBack: where the cube lay. Twins begin in another of the three columns."""
+    """TakeItBack: where the cube lay. It has no twin, since the hand's pose at the target differs
+    with the column from which it came.
+    """
 
-    has_twin = True
+    has_choices = True
     _is_reached = False
 
     def _column(self) -> int:
@@ -292,23 +297,6 @@ class Origin(SceneFacts):
         if np.linalg.norm(gap[:2]) < _MOVED:
             return {"origin": VisibleFact(_COLUMNS[self._column()])}, decides
         return {}, decides
-
-    def flip(self) -> None:
-        scene = self._scene
-        column = self._column()
-        shift = ((column + 1) % 3 - column) * _COLUMN
-        for thing in (scene.cube, scene.initial_region):
-            pose = thing.pose.raw_pose.clone()
-            pose[:, 1] += shift
-            thing.pose = pose
-
-    def candidates(self, time: int) -> Candidates | None:
-        if not bool(self._scene.goal_reached_status[0]):
-            return None
-        x, y = place_of(self._scene.initial_region)[:2].tolist()
-        column = self._column()
-        places = [[x, y + (other - column) * _COLUMN] for other in range(3)]
-        return Candidates(places, [column])
 
     def things(self) -> Mapping[str, Any]:
         return {"cube": self._scene.cube}

@@ -54,9 +54,9 @@ from mme_vla.utils.io import to_line
 LINES, FIGURES = "twins.jsonl", "twins.json"
 MEMORY_OFF = "drop:all"
 """The arm without memory: everything remembered is removed."""
-SAME_STATE = 0.005
-"""In the units of the state (rad, m): what twins may differ by. Those of one state differ by less
-than 0.0001, and a cube that was brought from another place by 0.03.
+SAME_STATE = 0.01
+"""What the states of twins may differ by, in their units (rad, m). Policies have told scenes apart
+by a yaw that differed by 0.015 rad.
 """
 NOTHING = RenderRequest({}, now=(), grounded=False)
 

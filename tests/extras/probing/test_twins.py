@@ -71,7 +71,7 @@ def test_a_pair_differs_in_what_is_correct_alone() -> None:
     check_pair(first, other)
     wrong = {
         "goal": replace(other, goal="stay"),
-        "state differs by 0.01 from": replace(other, state=np.full(8, 0.01)),
+        "state differs by 0.02 from": replace(other, state=np.full(8, 0.02)),
         "same candidate": replace(first, candidates=Candidates(SQUARE[::-1].tolist(), [3])),
         "number": replace(first, candidates=Candidates(SQUARE[:3].tolist(), [1])),
         "elsewhere": replace(first, candidates=Candidates((SQUARE + 9).tolist(), [1])),
