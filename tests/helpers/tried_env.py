@@ -53,8 +53,8 @@ def try_commands(
     """
     scenes = (*env, tasks, "episodes=2")
     run(folder, variables, "record", *scenes, "output=data")
-    shown = run(folder, variables, "inspect", *env, "dataset=data")
-    assert "execution steps to train on" in shown
+    text = run(folder, variables, "inspect", *env, "dataset=data")
+    assert "execution steps to train on" in text
     data = ("data.sources=[data]", "train.steps=2", "output=run")
     run(folder, variables, "train", *env, "model=framesamp_modul", *SMALL, *BRIEF, *data)
 

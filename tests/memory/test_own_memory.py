@@ -84,7 +84,7 @@ def test_a_scorer_of_the_first_frame_does_not_take_the_budget_twice(rules):
     assert len(np.unique(selection, axis=0)) == len(selection) == 40
 
 
-def test_a_patch_that_is_chosen_twice_fails_the_check(rules, monkeypatch):
+def test_a_selection_with_a_patch_twice_fails_the_check(rules, monkeypatch):
     def first_twice(*args):
         selection = TokenDrop.select(*args)
         return selection[[0, *range(len(selection) - 1)]]

@@ -188,12 +188,12 @@ def test_labels_of_facts_count_them_in_their_episode_and_mark_their_frames(tmp_p
     source = EpisodeSource(sample_with(tmp_path, *facts))
     count = label_column(source, FACT, "labels")
     is_visible = label_column(source, FACT_VISIBLE, "labels")
-    first, second, rest = np.split(count, np.cumsum(source.lengths[:2]))
-    assert set(first) == {1} and not rest.any()
+    first, second, others = np.split(count, np.cumsum(source.lengths[:2]))
+    assert set(first) == {1} and not others.any()
     frames = np.arange(len(second))
     assert second.tolist() == ((frames >= 8).astype(int) + (frames >= 20)).tolist()
-    shown = np.split(is_visible, np.cumsum(source.lengths[:2]))
-    assert [np.flatnonzero(part).tolist() for part in shown] == [
+    visible = np.split(is_visible, np.cumsum(source.lengths[:2]))
+    assert [np.flatnonzero(part).tolist() for part in visible] == [
         [0, 1, 2, 3],
         [*range(8, 13), *range(20, 31)],
         [],

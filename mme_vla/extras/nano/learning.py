@@ -468,16 +468,16 @@ def _labels(memory: Memory, demonstration: Demonstration) -> FrameLabels:
     def count(begins: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         return lambda frames: np.searchsorted(begins, frames, side="right").astype(np.float32)
 
-    def is_in(marked: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda frames: np.isin(frames, marked).astype(np.float32)
+    def is_in(labelled: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda frames: np.isin(frames, labelled).astype(np.float32)
 
     begins = demonstration.boundaries
     known = {SUBTASK: count(begins), BOUNDARY: is_in(begins)}
     if demonstration.facts is not None:
         spans = [fact.frames for fact in demonstration.facts]
-        shown = [np.arange(first, last + 1) for first, last in spans]
+        visible = [np.arange(first, last + 1) for first, last in spans]
         known[FACT] = count(np.sort([first for first, _ in spans]))
-        known[FACT_VISIBLE] = is_in(np.concatenate([np.empty(0, np.int64), *shown]))
+        known[FACT_VISIBLE] = is_in(np.concatenate([np.empty(0, np.int64), *visible]))
     return {name: known[name] for name in labels_read(memory) if name in known}
 
 

@@ -184,7 +184,7 @@ class TrainingRow(BaseModel):
     objects: Objects = Objects()
 
     @model_validator(mode="after")
-    def _is_whole(self) -> Self:
+    def _is_complete(self) -> Self:
         for i, message in enumerate(self.messages):
             if not is_text(message.content):
                 raise ValueError(f"has half a character in messages[{i}].content.")

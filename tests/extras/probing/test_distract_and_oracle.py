@@ -23,7 +23,7 @@ JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
 BEGAN = [0, 9, 21, 30, 44]
 
 
-def test_unrelated_episodes_come_first_in_their_order_and_no_more_than_were_asked_for() -> None:
+def test_unrelated_episodes_come_first_in_their_order_and_no_more_than_the_word_says() -> None:
     policy = quick_policy("framesamp_modul", 8).eval()
 
     def actions_after(word: str, sessions: list[Recording]) -> np.ndarray:
@@ -32,10 +32,10 @@ def test_unrelated_episodes_come_first_in_their_order_and_no_more_than_were_aske
         return np.concatenate([np.stack(envs.made[job].actions) for job in JOBS])
 
     first, second, third = made_up()
-    shown = actions_after("distract:2", [first, second, third])
-    assert np.array_equal(shown, actions_after("distract:2", [first, second]))
-    assert not np.array_equal(shown, actions_after("distract:2", [second, first]))
-    assert not np.array_equal(shown, actions_after("pause:0", []))
+    actions = actions_after("distract:2", [first, second, third])
+    assert np.array_equal(actions, actions_after("distract:2", [first, second]))
+    assert not np.array_equal(actions, actions_after("distract:2", [second, first]))
+    assert not np.array_equal(actions, actions_after("pause:0", []))
 
 
 class TellingEnv(ScriptedEnv):
@@ -53,8 +53,8 @@ def make_telling_env(task: str, split: str, episode: int, max_steps: int) -> Tel
 class Noting(ProbedPolicy):
     """Notes the times of what is remembered at every chunk."""
 
-    def snapshot(self, episode: ProbedEpisode, drawn: Any = None) -> Any:
-        match = super().snapshot(episode, drawn)
+    def snapshot(self, episode: ProbedEpisode, noise: Any = None) -> Any:
+        match = super().snapshot(episode, noise)
         self.noted.append(
             (episode.n_observed_frames - 1, [entry.time for entry in match[1][0].entries])
         )
