@@ -7,6 +7,10 @@ python benchmarks/mikasa_table.py --output outputs/unit --tasks RememberColor3
 --models framesamp_modul --seeds 1 --steps 20 --episodes 1 --pairs 1
 
 The same command continues an interrupted run. Rows are added when a training has been evaluated.
+Of a table without gaps, such as the published one, it prints means and rank correlations:
+
+python scripts/published.py unpack mikasa24
+python benchmarks/mikasa_table.py --output outputs/published/mikasa24
 """
 
 import argparse
@@ -136,6 +140,17 @@ def measure(args: argparse.Namespace, run: Run | None = None) -> list[dict[str, 
         run = partial(run_command, threads=max(1, (os.cpu_count() or 1) // args.jobs))
     folder: Path = args.output
     folder.mkdir(parents=True, exist_ok=True)
+    table = folder / "table.csv"
+    known = {(row["model"], row["seed"], row["task"]) for row in read_table(table)}
+    units: list[tuple[str, int, Sequence[str]]] = []
+    for seed in range(args.seeds):
+        for model in args.models:
+            tasks = [task for task in args.tasks if (model, str(seed), task) not in known]
+            if tasks:
+                units.append((model, seed, tasks))
+    if not units:
+        return read_table(table)
+
     missing = [task for task in args.tasks if not recording(folder, task).is_dir()]
     with ThreadPoolExecutor(args.jobs) as pool:
         list(pool.map(partial(_record, args=args, run=run), missing))
@@ -146,14 +161,6 @@ def measure(args: argparse.Namespace, run: Run | None = None) -> list[dict[str, 
         for seed in seeds:
             save_initial_policy(tower, initial_policy(folder, seed), seed)
 
-    table = folder / "table.csv"
-    known = {(row["model"], row["seed"], row["task"]) for row in read_table(table)}
-    units: list[tuple[str, int, Sequence[str]]] = []
-    for seed in range(args.seeds):
-        for model in args.models:
-            missing = [task for task in args.tasks if (model, str(seed), task) not in known]
-            if missing:
-                units.append((model, seed, missing))
     with ThreadPoolExecutor(args.jobs) as pool:
         futures = [pool.submit(_rows_of, unit, args, run) for unit in units]
         try:

@@ -23,6 +23,7 @@ BOARD = ROOT / "mme_vla" / "assets" / "board"
 INDEX = RESULTS / "SHA256SUMS"
 ARCHIVES = {
     "clock": RESULTS / "clock.tar.xz",
+    "mikasa24": RESULTS / "mikasa24.tar.xz",
     "nano": RESULTS / "nano.tar.xz",
     "nano16/further": BOARD / "further.tar.xz",
     "nano16/further-waypoint": BOARD / "further-waypoint.tar.xz",

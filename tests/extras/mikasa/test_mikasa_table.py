@@ -1,7 +1,9 @@
 """benchmarks/mikasa_table.py: what a run lacks is carried out, once, and stands in the table."""
 
 import json
+import re
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,11 +19,14 @@ from benchmarks.mikasa_table import (
     measure,
     summary,
 )
+from helpers import REPOSITORY
+from helpers.published import published_folder
 from helpers.rollout_fakes import save_records
 from mme_vla.config.composition import compose
 from mme_vla.envs.base import environment
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.store import read_folders
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
 
 CHOSEN = ["RememberColor3", "SeqOfColors3"]
@@ -130,6 +135,27 @@ def test_the_ranking_is_compared_with_nanomme_and_the_paper() -> None:
     assert "success with the paper, 4 models" in of_paper
     assert "twin accuracy with nanoMME-16, 5 models and 1 task: -1.00" in twins
     assert agreements([row for row in rows if row["model"] in order[:2]]) == []
+
+
+def test_the_published_table_is_of_its_records_and_the_page_prints_its_correlations() -> None:
+    folder = published_folder("mikasa24")
+    rows = measure(arguments(folder, tasks=list(TASKS), models=list(MODELS)), Commands(stop=0))
+    assert len(rows) == 24 * 7 * 2, "nothing is measured again"
+    for model in MODELS:
+        for seed in "01":
+            folders = folder / "evaluation" / model / seed
+            records = read_folders(sorted(folders.rglob("*.jsonl")))
+            counts = Counter(record.task for record in records if record.success)
+            solved = {
+                row["task"]: int(row["successes"])
+                for row in rows
+                if (row["model"], row["seed"]) == (model, seed)
+            }
+            assert len(records) == 240 and solved == {task: counts[task] for task in TASKS}
+    page = (REPOSITORY / "docs" / "evidence" / "mikasa.md").read_text()
+    for sentence in agreements(rows):
+        value, low, high = re.findall(r"-?\d\.\d\d", sentence)
+        assert f"{value} ({low} to {high})" in page
 
 
 @pytest.mark.parametrize("stop", [1, 2, 3, 4, 6, 8])
