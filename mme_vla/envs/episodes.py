@@ -19,15 +19,24 @@ def choose_tasks(tasks: str | Sequence[str], env: str = "mme_vla") -> list[str]:
 
     Args:
         tasks: `all` of the environment, a name, several in one text (`StopCube,BinFill`), or a list
-            of names. Tasks of the user's own need the plugin that registers them.
+            of names. A suite or another group that the environment declares names those of its
+            tasks that can be built here. Tasks of the user's own need the plugin that registers
+            them.
         env: the environment.
     """
     if isinstance(tasks, str):
         tasks = tasks.split(",")
-    names = [str(name).strip() for name in tasks]
     source = environment(env)
-    if names == [ALL]:
-        names = list(source.tasks)
+    known = list(source.tasks)
+    groups: dict[str, Sequence[str]] = {ALL: known, **source.suites}
+    for grouping in source.groupings.values():
+        groups |= grouping
+    names: list[str] = []
+    for word in tasks:
+        name = str(word).strip()
+        members = groups.get(name, [name])
+        # Where none can be built, the check of the first one says what it lacks.
+        names += [task for task in members if task in known] or members
     for name in names:
         source.check_task(name)
     once = names and len(set(names)) == len(names)

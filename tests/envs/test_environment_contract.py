@@ -17,6 +17,7 @@ from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy
 from mme_vla.cli.record import RecordRun, _rate
 from mme_vla.envs import base
 from mme_vla.envs.base import Environment, EpisodeEnv
+from mme_vla.envs.episodes import choose_tasks
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector import worker
@@ -147,6 +148,20 @@ def test_settings_know_the_limit_of_each_task_unless_another_is_set() -> None:
     assert [settings.limit_of(task) for task in ("Short", "Wide")] == [4, 9]
     assert RolloutSettings(env="corridors", max_steps=6).limit_of("Short") == 6
     assert RolloutSettings().limit_of("StopCube") == 1300
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_suite_or_a_group_names_its_tasks_that_can_be_built(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert choose_tasks("Walks", "corridors") == ["Short", "Wide"]
+    assert choose_tasks(["long", "brief"], "corridors") == ["Wide", "Short"]
+    with pytest.raises(UserError, match="must name each task once"):
+        choose_tasks("long,Wide", "corridors")
+    monkeypatch.setattr(Corridors, "tasks", ("Short",))
+    assert choose_tasks("Walks", "corridors") == ["Short"]
+    with pytest.raises(UserError, match="Unknown task 'Wide'"):
+        choose_tasks("wide", "corridors")
 
 
 def records() -> list[EpisodeRecord]:
