@@ -238,7 +238,7 @@ IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
 
 
-Index = Annotated[StrictInt, BeforeValidator(_integer), Field(ge=0)]
+Index = Annotated[StrictInt, Field(ge=0), BeforeValidator(_integer)]
 
 
 class Flags(BaseModel):
@@ -249,7 +249,7 @@ class Flags(BaseModel):
 class ResetMessage(BaseModel):
     """`{"reset": True}`, with the seed of the episode's noise if the client chooses it."""
 
-    seed: Annotated[Index, Field(lt=2**63)] | None = None
+    seed: Annotated[StrictInt, Field(ge=0, lt=2**63), BeforeValidator(_integer)] | None = None
 
 
 class BufferMessage(BaseModel):

@@ -4,115 +4,189 @@ Files, messages and command lines are checked once, where they come in. The code
 the checked object.
 """
 
-import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import PydanticSerializationError, to_json
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 
 _TYPES = {
-    "bool_type": "true or false",
-    "bool_parsing": "true or false",
-    "int_type": "a whole number",
-    "int_parsing": "a whole number",
-    "float_type": "a number",
-    "float_parsing": "a number",
-    "string_type": "a text",
-    "string_parsing": "a text",
-    "dataclass_type": "a section of keys",
-    "model_type": "a section of keys",
-    "dict_type": "a map of keys",
-    "tuple_type": "a list",
+    "boolean": "true or false",
+    "integer": "a whole number",
+    "number": "a number",
+    "string": "a text",
+    "null": "null",
+    "array": "a list",
+    "object": "a section of keys",
 }
-"""What a value must be, by pydantic's names of mistakes."""
+_BOUNDS = {
+    "exclusiveMinimum": " above {}",
+    "minimum": ", {} or more",
+    "maximum": " at most {}",
+    "exclusiveMaximum": " below {}",
+    "minLength": " of length {} or more",
+    "maxLength": " of length {} or less",
+}
+"""Words for what a JSON schema allows."""
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+_FEW = 4  # entries of a list that are written out
+_LARGE = (np.ndarray, list, tuple, Mapping)
+_Schema = Mapping[str, Any]
 
 
-def validated[T](kind: type[T], value: object, what: str, where: str = "") -> T:
+def validated[T](
+    kind: type[T], value: object, what: str, where: str = "", *, strict: bool = False
+) -> T:
     """Check a value against a pydantic model, a dataclass or any other type pydantic knows.
 
     A validator of a field raises a `ValueError` whose text continues the name of the key. A text
     that ends with a full stop is the whole sentence; otherwise the value is added:
-    `ValueError("must be an even number")` becomes "steps must be an even number, got 3."
+    `ValueError("must be an even number")` becomes "steps must be an even number, got 3." The
+    message of a `UserError` stays as it is.
 
     Args:
         kind: the type.
         value: what came from outside.
         what: its name at the beginning of a sentence, such as "The request".
         where: the dotted key of `value` itself, which precedes the keys inside it.
+        strict: read the value as JSON, refuse unknown keys, and convert no text to a number.
 
     Raises:
         UserError: the first value that does not fit, by its key, with what is allowed.
     """
+    adapter: TypeAdapter[T] = _adapter(kind)  # type: ignore[arg-type]
     try:
-        checked: T = _adapter(kind).validate_python(value)  # type: ignore[arg-type]
+        if strict:
+            # Of JSON, lists and maps may become tuples and dataclasses in strict mode.
+            text = to_json(value, inf_nan_mode="constants", fallback=brief)
+            checked = adapter.validate_json(text, strict=True, extra="forbid")
+        else:
+            checked = adapter.validate_python(value)
+    except PydanticSerializationError as error:  # half of a surrogate pair
+        raise UserError(f"{what} holds a text that is not Unicode: {brief(str(error))}.") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise UserError(_sentence(first, kind, what, where)) from None
+        raise _mistake(error, adapter.json_schema(ref_template="{model}"), what, where) from None
     return checked
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _sentence(error: ErrorDetails, kind: Any, what: str, where: str) -> str:
-    """Say what is wrong with one value."""
-    key = _key(where, error["loc"]) or what
-    value, rule = error["input"], error["type"]
-    if rule == "missing":
-        meaning = _descriptions(kind).get(str(error["loc"][-1]), "")
-        present = listed(value) if isinstance(value, Mapping) and value else "none"
-        lacking = _key("", error["loc"])
+def _mistake(error: ValidationError, root: _Schema, what: str, where: str) -> UserError:
+    """What is wrong with one value, by the JSON schema of all."""
+    errors = error.errors(include_url=False)
+    # A misspelt key says more than the one that is missing for it.
+    misspelt = [one for one in errors if one["type"] in _UNKNOWN]
+    first = (misspelt or errors)[0]
+    rule = first["type"]
+    value = first["input"]
+    problem = first.get("ctx", {}).get("error")
+    if isinstance(problem, UserError):
+        return problem
+    path = list(first["loc"])
+    name = path.pop() if rule in ("missing", *_UNKNOWN) else None
+    key, schema = _place(root, path, where)
+    alternatives = _alternatives(schema, root)
+    if isinstance(name, str):  # a number is of an item that a short list lacks
+        known: dict[str, _Schema] = {}
+        for one in alternatives:
+            known.update(one.get("properties", {}))
+        if rule != "missing":
+            return UserError(unknown_key(key, name, known))
+        meaning = known.get(name, {}).get("description")
+        lacking = f"the key {name!r}"
         if meaning:
             lacking += f" ({meaning})"
-        return f"{what} lacks {lacking}; it has {present}."
-    if rule in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = _descriptions(kind) if len(error["loc"]) == 1 else {}
-        near = did_you_mean(str(error["loc"][-1]), known) if known else "Leave it out."
-        return f"Unknown key {key}. {near}"
+        return UserError(f"{key or what} lacks {lacking}; it has {listed(value) or 'none'}.")
+    key = key or what
+    shown = described(value)
+    if schema.get("writeOnly"):
+        shown = "(hidden)"
     if rule == "value_error":
-        text = str(error["ctx"]["error"])
-        return f"{key} {text}" if text.endswith(".") else f"{key} {text}, got {described(value)}."
-    if rule == "literal_error" and isinstance(value, str):
-        choices = re.findall(r"'([^']*)'", error["ctx"]["expected"])
-        return f"{key}={brief(value)}. {did_you_mean(value[:200], choices)}"
-    if rule in _TYPES:
-        return f"{key}={described(value)} must be {_TYPES[rule]}."
-    # pydantic's own sentences: "Input should be greater than 0".
-    _, _, expected = error["msg"].partition(" should ")
-    return f"{key}={described(value)} must {expected or error['msg']}."
+        text = str(problem)
+        if not text.endswith("."):
+            text += f", got {shown}."
+        return UserError(f"{key} {text}")
+    choices: list[Any] = []
+    for one in alternatives:
+        choices += one.get("enum", [])
+    if choices and isinstance(value, str):
+        return UserError(f"{key}={shown}. {did_you_mean(value, map(str, choices))}")
+    # Where the schema is open: pydantic's own "Input should be greater than 0".
+    allowed = _words(schema, root)
+    expected = f"be {allowed}" if allowed else first["msg"].rpartition(" should ")[2]
+    return UserError(f"{key}={shown} must {expected}.")
 
 
-def _key(where: str, location: tuple[int | str, ...]) -> str:
-    """The dotted name of a value, with the numbers of list entries in brackets."""
+def unknown_key(section: str, key: object, known: Iterable[str]) -> str:
+    """The message for a key that a section cannot have."""
+    name = brief(key, quote=False)
+    if section:
+        name = f"{section}.{name}"
+    return f"Unknown key {name}. {did_you_mean(str(key), known)}"
+
+
+def _place(root: _Schema, path: Iterable[int | str], where: str) -> tuple[str, _Schema]:
+    """The dotted name of a value, with the numbers of list entries in brackets, and its schema."""
     key = where
-    for part in location:
+    schema = root
+    for part in path:
+        if part == "[key]":
+            return key, {}  # the key itself is mistaken
+        inner: list[Any] = []
+        for one in _alternatives(schema, root):
+            if isinstance(part, int):
+                inner += [*one.get("prefixItems", ())[part : part + 1], one.get("items")]
+            else:
+                inner += [one.get("properties", {}).get(part), one.get("additionalProperties")]
+        inner = [one for one in inner if isinstance(one, Mapping)]
         if isinstance(part, int):
             key += f"[{part}]"
-        else:
+        elif inner:
             name = brief(part, quote=False)
             key = f"{key}.{name}" if key else name
-    return key
+        else:
+            continue  # pydantic's name of an alternative
+        schema = inner[0] if inner else {}
+    return key, schema
 
 
-def _descriptions(kind: Any) -> dict[str, str]:
-    """What each key of a model means, by the name that the outside uses."""
-    if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
-        return dict.fromkeys(getattr(kind, "__dataclass_fields__", {}), "")
-    meanings = {}
-    for name, field in kind.model_fields.items():
-        meanings[field.alias or name] = field.description or ""
-    return meanings
+def _alternatives(schema: _Schema, root: _Schema) -> list[_Schema]:
+    """What a value may be, without references."""
+    definitions = root.get("$defs", {})
+    schema = definitions.get(schema.get("$ref"), schema)
+    return [definitions.get(one.get("$ref"), one) for one in schema.get("anyOf", [schema])]
+
+
+def _words(schema: _Schema, root: _Schema) -> str:
+    """What a schema allows, in words; empty where it allows anything."""
+    alternatives = []
+    for one in _alternatives(schema, root):
+        words = _TYPES.get(one.get("type", ""), "")
+        if "enum" in one or "const" in one:
+            words = " or ".join(map(str, one.get("enum") or [one["const"]]))
+        elif "prefixItems" in one:
+            items = [_words(item, root) for item in one["prefixItems"]]
+            words = f"a list of {len(items)} values: {', '.join(items)}"
+        elif one.get("items"):
+            words = f"a list, each {_words(one['items'], root)}"
+        elif "minimum" in one and "maximum" in one:
+            words += f" from {one['minimum']} to {one['maximum']}"
+        else:
+            bounds = [text.format(one[key]) for key, text in _BOUNDS.items() if key in one]
+            words += " and".join(bounds)
+        alternatives.append(words)
+    return " or ".join(alternatives)
 
 
 def described(value: object) -> str:
-    """A value for a message: arrays by dtype and shape, lists by length, all else as `brief`.
+    """A value for a message: arrays by dtype and shape, long lists by length, all else as `brief`.
 
     >>> described([np.zeros((2, 3), np.uint8)])
     'a list of 1 value, the first: uint8 [2, 3]'
@@ -120,8 +194,8 @@ def described(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {list(value.shape)}"
     if isinstance(value, list | tuple):
-        if not value:
-            return "an empty list"
+        if len(value) <= _FEW and not any(isinstance(item, _LARGE) for item in value):
+            return brief(value)
         count = "1 value" if len(value) == 1 else f"{len(value)} values"
         first = "a list" if isinstance(value[0], list | tuple) else described(value[0])
         return f"a list of {count}, the first: {first}"

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import pytest
 
-from mme_vla.config.sections import PathText, Positive, Range, read_section
+from mme_vla.config.sections import PathText, Positive, Range, Secret, read_section
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.serving.settings import ServeSettings
@@ -29,7 +29,7 @@ class Outer:
     places: tuple[int, ...] = ()
     fast: bool = False
     limit: int | None = None
-    secret: str | None = field(default=None, repr=False)
+    secret: Secret = field(default=None, repr=False)
     anything: Any = None
     port: Annotated[int, Range(0, 9)] | None = None
     seconds: Positive = 1.0
@@ -80,10 +80,8 @@ def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
             r"outer\.betas=\[0\.1\] must be a list of 2 values: a number, a number",
         ),
         ({"name": "a", "betas": "ab"}, r"outer\.betas='ab' must be a list of 2"),
-        (
-            {"name": "a", "places": [1, "x"]},
-            r"outer\.places=.* must be a list, each a whole number",
-        ),
+        ({"name": "a", "places": 1}, r"outer\.places=1 must be a list, each a whole number"),
+        ({"name": "a", "places": [1, "x"]}, r"outer\.places\[1\]='x' must be a whole number"),
         ({"name": "a", "port": 10}, r"outer\.port=10 must be a whole number from 0 to 9 or null"),
         ({"name": "a", "seconds": 0}, r"outer\.seconds=0 must be a number above 0"),
         ({"name": "a", "seconds": float("nan")}, r"outer\.seconds=nan must be a number above 0"),
@@ -109,8 +107,8 @@ def test_half_a_surrogate_pair_is_refused() -> None:
 
 
 def test_a_secret_is_not_reported() -> None:
-    with pytest.raises(UserError, match="secret must be a text or null") as error:
-        read_section(Outer, {"name": "a", "secret": 5317})
+    with pytest.raises(UserError, match="must be a text or null") as error:
+        read_section(Outer, {"name": "a", "secret": [5317]})
     assert "5317" not in str(error.value)
 
 

@@ -84,7 +84,7 @@ def test_other_robots_decide_nothing_and_say_nothing_of_options() -> None:
         ({"point": [7, 8]}, "the two numbers y, x"),
         ({"choice": []}, "the two numbers y, x"),
         ({"frames": 1}, "frames=null"),
-        ({"options_length": -1}, "options_length=-1 must be greater than or equal to 0"),
+        ({"options_length": -1}, "options_length=-1 must be a whole number from 0 to 65536"),
     ],
 )
 def test_impossible_choices_are_refused_by_the_key(changes: dict[str, Any], message: str) -> None:

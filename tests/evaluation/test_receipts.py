@@ -155,7 +155,7 @@ def test_changed_records_scenes_and_receipts_are_named(checkpoint: Path, tmp_pat
     other = tmp_path / "receipt-of-something-else.json"
     other.write_text(json.dumps({"settings": {}}))
     with pytest.raises(
-        UserError, match="is no receipt of an evaluation: The file lacks conditions"
+        UserError, match="is no receipt of an evaluation: The file lacks the key 'conditions'"
     ):
         receipts.verify(other)
     path.write_text(path.read_text().replace('"success": 1', '"success": 3'))

@@ -116,7 +116,7 @@ def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None
         ({"prompt": "subgaol"}, "Did you mean 'subgoal'"),
         ({"prompt_lenght": 3}, "Did you mean 'prompt_length'"),
         ({"image_size": "224"}, "image_size must be a positive"),
-        ({"embodiment": {"name": "mine"}}, "embodiment lacks cameras"),
+        ({"embodiment": {"name": "mine"}}, "embodiment lacks the key 'cameras'"),
         ({"stats": "nowhere.json"}, "nowhere.json"),
         ({"tokenizer": "nowhere.model"}, "nowhere.model"),
         ({"tokenizer_fingerprint": "0123"}, "fingerprint"),

@@ -183,7 +183,7 @@ def test_a_wrong_value_is_named(change, named):
 def test_a_missing_key_is_named(key):
     message = challenge([IMAGE], [IMAGE], states(1), True)
     del message[key]
-    with pytest.raises(UserError, match=f"lacks {key}"):
+    with pytest.raises(UserError, match=f"lacks the key '{key}'"):
         parse(message)
 
 

@@ -153,7 +153,7 @@ def test_damaged_rows_and_missing_images_are_named(tmp_path, data):
 @pytest.mark.parametrize(
     ("messages", "words"),
     [
-        (3, "messages=3 must be a valid list"),
+        (3, "messages=3 must be a list"),
         ([1, 2, 3], r"messages\[0\]=1 must be a section of keys"),
         ([{"role": "robot", "content": "a"}], r"messages\[0\]\.role='robot'\. .*assistant"),
         ([{"role": "user", "content": "\ud800"}], r"half a character in messages\[0\]\.content"),

@@ -28,19 +28,21 @@ class Outer(BaseModel):
     kind: Literal["simple", "grounded"] = "simple"
     count: Annotated[int, AfterValidator(even)] = 0
     inners: list[Inner] = []
+    short: Annotated[str, Field(max_length=3)] = ""
     name: str = Field(alias="the/name", description="what it is called")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"steps": "x"}, "steps='x' must be a whole number."),
-        ({"steps": -1}, "steps=-1 must be greater than or equal to 0."),
+        ({"steps": "x"}, "steps='x' must be a whole number, 0 or more."),
+        ({"steps": -1}, "steps=-1 must be a whole number, 0 or more."),
         ({"kind": "grounde"}, "kind='grounde'. Did you mean 'grounded'? Known: grounded, simple."),
-        ({"kind": 3}, "kind=3 must be 'simple' or 'grounded'."),
+        ({"kind": 3}, "kind=3 must be simple or grounded."),
         ({"count": 3}, "count must be an even number, got 3."),
         ({"inners": [{"width": 1}, {"width": None}]}, "inners[1].width=None must be a whole"),
-        ({"inners": [{}]}, "The file lacks inners[0].width; it has none."),
+        ({"inners": [{}]}, "inners[0] lacks the key 'width'; it has none."),
+        ({"short": "long"}, "short='long' must be a text of length 3 or less."),
         ({"stepz": 1}, "Unknown key stepz. Did you mean 'steps'?"),
         ({"the/name": 3}, "the/name=3 must be a text."),
     ],
@@ -56,7 +58,9 @@ def test_a_mistake_names_key_value_and_what_is_allowed(
 
 
 def test_a_missing_key_is_named_with_its_meaning() -> None:
-    with pytest.raises(UserError, match=r"The file lacks the/name \(what it is called\); it has"):
+    with pytest.raises(
+        UserError, match=r"The file lacks the key 'the/name' \(what it is called\); it has"
+    ):
         validated(Outer, {"steps": 1}, "The file")
 
 

@@ -232,7 +232,9 @@ def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str],
     lists = readings(2, listed=True)
     request = challenge(frames, frames, states, first=True, **lists)
     wrong = {
-        "lacks wrist_depth_list": {k: v for k, v in request.items() if k != "wrist_depth_list"},
+        "lacks the key 'wrist_depth_list'": {
+            k: v for k, v in request.items() if k != "wrist_depth_list"
+        },
         "front_depth_list must be depth in millimetres, one number a pixel": request
         | {"front_depth_list": []},
         r"front_depth_list must have one number a pixel of the image \[64, 64\]": request
