@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
+from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import PydanticSerializationError, to_json
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
@@ -36,6 +37,15 @@ _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 _FEW = 4  # entries of a list that are written out
 _LARGE = (np.ndarray, list, tuple, Mapping)
 _Schema = Mapping[str, Any]
+
+
+class _OpenSchema(GenerateJsonSchema):
+    """A JSON schema that allows anything where a type, such as a function, is none of JSON's."""
+
+    ignored_warning_kinds = {"skipped-choice", "non-serializable-default"}  # noqa: RUF012
+
+    def handle_invalid_for_json_schema(self, schema: Any, error_info: str) -> dict[str, Any]:
+        return {}
 
 
 def validated[T](
@@ -69,7 +79,8 @@ def validated[T](
     except PydanticSerializationError as error:  # half of a surrogate pair
         raise UserError(f"{what} holds a text that is not Unicode: {brief(str(error))}.") from None
     except ValidationError as error:
-        raise _mistake(error, adapter.json_schema(ref_template="{model}"), what, where) from None
+        root = adapter.json_schema(ref_template="{model}", schema_generator=_OpenSchema)
+        raise _mistake(error, root, what, where) from None
     return checked
 
 

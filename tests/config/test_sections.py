@@ -2,6 +2,7 @@
 was expected.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -35,6 +36,7 @@ class Outer:
     seconds: Positive = 1.0
     kind: Literal["simple", "grounded"] | None = None
     output: PathText | None = None
+    function: Callable[[float], float] = abs
 
 
 def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
