@@ -85,10 +85,15 @@ class Bar:
         if self.bar is not None:
             self.bar.stop()
 
-    def advance(self, steps: int = 1, text: str | None = None) -> None:
-        """Count finished steps, and replace the text; without a terminal, nothing."""
+    def advance(self, steps: int = 1) -> None:
+        """Count finished steps."""
         if self.bar is not None:
-            self.bar.update(self._task, advance=steps, description=text)
+            self.bar.advance(self._task, steps)
+
+    def describe(self, text: str) -> None:
+        """Replace the text beside the bar; without a terminal, nothing."""
+        if self.bar is not None:
+            self.bar.update(self._task, description=text)
 
     def say(self, text: str) -> None:
         """Print a line that stays."""

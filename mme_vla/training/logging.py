@@ -117,7 +117,7 @@ class ProgressLine(Bar):
             f" {values['train/grad_norm']:.2f} · {values['speed/samples_per_s']:.1f} samples/s ·"
             f" {values['memory/gib']:.1f} GiB"
         )
-        self.advance(0, text)
+        self.describe(text)
         if self.bar is None:
             self.say(f"step {step}/{self.total} · {text}")
 

@@ -116,23 +116,23 @@ def _mistake(error: ValidationError, root: _Schema, what: str, where: str) -> Us
             lacking += f" ({meaning})"
         return UserError(f"{key or what} lacks {lacking}; it has {listed(value) or 'none'}.")
     key = key or what
-    shown = described(value)
+    quoted = described(value)
     if schema.get("writeOnly"):
-        shown = "(hidden)"
+        quoted = "(hidden)"
     if rule == "value_error":
         text = str(problem)
         if not text.endswith("."):
-            text += f", got {shown}."
+            text += f", got {quoted}."
         return UserError(f"{key} {text}")
     choices: list[Any] = []
     for one in alternatives:
         choices += one.get("enum", [])
     if choices and isinstance(value, str):
-        return UserError(f"{key}={shown}. {did_you_mean(value, map(str, choices))}")
+        return UserError(f"{key}={quoted}. {did_you_mean(value, map(str, choices))}")
     # Where the schema is open: pydantic's own "Input should be greater than 0".
     allowed = _words(schema, root)
     expected = f"be {allowed}" if allowed else first["msg"].rpartition(" should ")[2]
-    return UserError(f"{key}={shown} must {expected}.")
+    return UserError(f"{key}={quoted} must {expected}.")
 
 
 def unknown_key(section: str, key: object, known: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ import pytest
 
 from helpers.h5_files import pose_at, robomme_robot, tool_at
 from helpers.prior_vla_runs import run
-from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import ScriptedEnv
 from helpers.serving_fakes import Served, challenge
 from mme_vla import UserError
@@ -96,7 +96,7 @@ def test_memoryvla_learns_them_and_is_executed_from_where_the_tool_is(
     exact = np.array([expected(t) for t in range(24)])
     np.testing.assert_allclose(stats.max[:6], exact[:, :6].max(0), atol=1e-5)
     envs = InlineEnvs(robot=panda, base=make_posed_env)
-    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=FACTS.max_steps)
+    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=1300)
     env = envs.made[Job("VideoUnmask", "test", 1)]
     assert record.action_space == "ee_delta" and len(env.actions) == record.steps > 8
     sent, stood = np.stack(env.actions), np.stack(env.poses[: len(env.actions)])

@@ -56,7 +56,8 @@ class RolloutProgress(Bar):
         """One episode ended; `again` if it will be tried once more, and does not count yet."""
         if not again:
             self._outcomes[record.outcome] += 1
-            self.advance(1, self._prefix + self.summary)
+            self.advance()
+            self.describe(self._prefix + self.summary)
         seconds = record.seconds
         episode = f"{record.task} {record.episode}"
         if record.difficulty:
