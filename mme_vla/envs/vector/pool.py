@@ -249,7 +249,7 @@ class VecEnv:
         for state in self._workers:
             try:
                 protocol.send(state.connection, protocol.CLOSE)
-                state.connection.close()  # ends the sending of a reply that nobody has taken
+                state.connection.close()  # ends the sending of a reply that was not taken
             except OSError:
                 pass  # it is gone already
         until = time.monotonic() + _CLOSING_SECONDS
