@@ -19,6 +19,7 @@ from helpers import REPOSITORY
 from helpers.rollout_fakes import InlineEnvs, roll
 from helpers.scripted_env import ScriptedEnv, make_scripted_env
 from helpers.serving_fakes import Served
+from helpers.tried_env import SMALL
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli.cache import main as cache_main
 from mme_vla.cli.inspect import main as inspect_main
@@ -45,15 +46,6 @@ BRIEF = [
     "train.workers=0",
     "train.device=cpu",
     "logger=none",
-]
-SMALL = [
-    "backbone.depth=1",
-    "memory.budget=64",
-    "backbone.vision.depth=1",
-    "backbone.vision.image_size=16",
-    "backbone.vision.patch_size=1",
-    "backbone.vision.width=16",
-    "backbone.vision.mlp_dim=16",
 ]
 
 
