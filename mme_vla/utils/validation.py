@@ -131,7 +131,8 @@ def _mistake(error: ValidationError, root: _Schema, what: str, where: str) -> Us
         return UserError(f"{key}={quoted}. {did_you_mean(value, map(str, choices))}")
     # Where the schema is open: pydantic's own "Input should be greater than 0".
     allowed = _words(schema, root)
-    expected = f"be {allowed}" if allowed else first["msg"].rpartition(" should ")[2]
+    message, _, _ = first["msg"].partition(", unable to parse")
+    expected = f"be {allowed}" if allowed else message.rpartition(" should ")[2]
     return UserError(f"{key}={quoted} must {expected}.")
 
 
@@ -152,10 +153,9 @@ def _place(root: _Schema, path: Iterable[int | str], where: str) -> tuple[str, _
             return key, {}  # the key itself is mistaken
         inner: list[Any] = []
         for one in _alternatives(schema, root):
-            if isinstance(part, int):
+            if isinstance(part, int):  # an item, or the key of a map
                 inner += [*one.get("prefixItems", ())[part : part + 1], one.get("items")]
-            else:
-                inner += [one.get("properties", {}).get(part), one.get("additionalProperties")]
+            inner += [one.get("properties", {}).get(part), one.get("additionalProperties")]
         inner = [one for one in inner if isinstance(one, Mapping)]
         if isinstance(part, int):
             key += f"[{part}]"
