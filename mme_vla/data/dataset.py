@@ -293,7 +293,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         if source.robot.action.frames is None:
             return source.past_actions(step.episode, step.index, most, self.action_offset)
         now = int(frames.transformed(np.array(step.index)))
-        rows = frames.real[max(frames.exec_start, now - most) : now] + self.action_offset
+        # Each frame of the execution brings the action that led to it, also where it is repeated.
+        executed = frames.real[frames.exec_start : now + 1]
+        executed = executed[executed > step.exec_start]
+        rows = executed[max(len(executed) - most, 0) :] - 1 + self.action_offset
         if not len(rows):
             return source.past_actions(step.episode, step.index, 0, self.action_offset)
         return source.actions(step.episode, int(rows[0]), int(rows[-1]) + 1)[rows - rows[0]]
