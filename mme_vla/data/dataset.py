@@ -1,5 +1,6 @@
 """The training dataset: one item is one step of an execution phase."""
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -225,8 +226,11 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         decisions = self.sources[source].decisions(episode)
         if not self.processor.samples.full_chunks_only:
             return decisions
-        short = self.processor.embodiment.action.horizon - 1
-        return decisions[: max(len(decisions) - short, 0)]
+        horizon = self.processor.embodiment.action.horizon
+        if self.sources[source].robot.action.frames is None:  # a motion for each decision
+            return decisions[: max(len(decisions) - horizon + 1, 0)]
+        last = int(self.sources[source].lengths[episode]) - horizon - self.action_offset
+        return decisions[: bisect_right(decisions, last)]
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, which the random part of items depends on."""
