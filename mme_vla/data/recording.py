@@ -127,35 +127,29 @@ class Recording:
         """
         if stop <= start:
             return
+        has_one_a_frame = self.source.robot.action.frames is not None
+        begun = self.exec_start + 1
+        if has_one_a_frame and not video and start < begun < stop:
+            # No action of the robot led to the first frame of the execution, as after a reset.
+            self.show(running, start, begun, required)
+            self.show(running, begun, stop, required)
+            return
         if not video:
             running.options = self.source.options(self.episode)
+        frames = np.arange(start, stop)
+        demo = np.ones(len(frames), bool) if video else frames < self.exec_start
+        actions = None
+        if not video and not has_one_a_frame:
+            done = self.source.past_actions(self.episode, start - 1, self.length)
+            actions = self.source.past_actions(self.episode, stop - 1, self.length)[len(done) :]
+        elif not video and start >= begun:
+            actions = self.source.actions(self.episode)[frames - 1 + self.action_offset]
+        states = self.source.states(self.episode, start, stop)
         views, rendered = self.views(start, stop, required)
-        has_one_a_frame = self.source.robot.action.frames is not None
-        parts = [(start, stop)]
-        if has_one_a_frame and not video and start <= self.exec_start < stop - 1:
-            # No action of the robot led to the first frame of the execution.
-            parts = [(start, self.exec_start + 1), (self.exec_start + 1, stop)]
-        for first, end in parts:
-            frames = np.arange(first, end)
-            demo = np.ones(len(frames), bool) if video else frames < self.exec_start
-            actions = None
-            if not video and not has_one_a_frame:
-                done = self.source.past_actions(self.episode, first - 1, self.length)
-                actions = self.source.past_actions(self.episode, end - 1, self.length)[len(done) :]
-            elif not video and first > self.exec_start:
-                actions = self.source.actions(self.episode)[frames - 1 + self.action_offset]
-            states = self.source.states(self.episode, first, end)
-            if rendered is None:
-                of_part = {name: view[frames - start] for name, view in views.items()}
-                running.observe(of_part, states, demo, actions)
-                continue
-            of_part, places = {}, {}
-            for name, view in views.items():
-                numbers = start + rendered[name]
-                inside = (numbers >= first) & (numbers < end)
-                of_part[name] = view[inside]
-                places[name] = numbers[inside] - first
-            running.observe(of_part, states, demo, actions, rendered=places)
+        if rendered is None:
+            running.observe(views, states, demo, actions)
+        else:
+            running.observe(views, states, demo, actions, rendered=rendered)
 
 
 def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
