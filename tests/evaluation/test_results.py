@@ -35,6 +35,7 @@ from mme_vla.evaluation.results.tables import (
     comparison_table,
     leaderboard,
     overview,
+    runs_table,
     to_csv,
     to_latex,
     to_markdown,
@@ -420,6 +421,16 @@ def test_the_best_of_several_methods_is_named_with_those_that_solve_as_many(
         made += records(name, {"StopCube": [number < n_solved for number in range(4)]})
     results = aggregate(made, Protocol.of_records(made))
     assert conclude(results, []) == [sentence]
+
+
+def test_every_figure_of_tasks_with_unequal_numbers_of_episodes_is_a_mean_over_tasks() -> None:
+    made = records("mine", {"StopCube": [1], "BinFill": [0] * 9})
+    results = aggregate(made, Protocol.of_records(made))
+    assert results.methods[0].average.mean == 50
+    assert runs_table(results).rows[0][-1] == "50.00"
+    assert conclude(results, [])[0].startswith(
+        "mine solves 50.0 % on average over 2 tasks, 10 episodes in all (95 % interval"
+    )
 
 
 def test_a_small_run_shows_what_it_has_within_eighty_columns(

@@ -186,8 +186,12 @@ def conclude(results: Results, comparisons: Sequence[Comparison]) -> list[str]:
     tasks = counted(len(protocol.averaged), "task")
     if len(protocol.averaged) == 1:
         tasks = protocol.averaged[0]
-    text = f"{best.label} solves {best.average.value:.1f} % of {counted(n_episodes, 'episode')}"
-    text += f" of {tasks}"
+    text = f"{best.label} solves {best.average.value:.1f} %"
+    lengths = {len(protocol.numbers_of(task)) for task in protocol.averaged}
+    if len(lengths) == 1 or best.average.mean is None:
+        text += f" of {counted(n_episodes, 'episode')} of {tasks}"
+    else:  # a mean over tasks of unequal numbers of episodes is no share of all episodes
+        text += f" on average over {tasks}, {counted(n_episodes, 'episode')} in all"
     if best.average.interval is not None:
         low, high = best.average.interval
         text += f" ({100 * protocol.confidence:g} % interval {low:.1f} to {high:.1f})"
