@@ -364,7 +364,7 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     for new in records:
         at = (new.run, new.key)
         old = merged.get(at)
-        if old is None or (old.outcome == "error" and new.outcome != "error"):
+        if old is None:
             merged[at] = new
             continue
         require(
@@ -373,6 +373,9 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             f" {new.seed}: these are not the same benchmark; evaluate both from the same episode"
             " metadata.",
         )
+        if old.outcome == "error" and new.outcome != "error":
+            merged[at] = new
+            continue
         if new.outcome == "error":
             continue
         scenes = {new.named_scene, old.named_scene} - {None}

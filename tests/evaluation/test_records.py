@@ -167,6 +167,10 @@ def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
 def test_one_episode_in_two_environments_is_refused() -> None:
     with pytest.raises(UserError, match="seeds 540000 and 1"):
         merge([record(), record(seed=1)])
+    failed = record(seed=1, outcome="error")
+    for both in ([record(), failed], [failed, record()]):
+        with pytest.raises(UserError, match="not the same benchmark"):
+            merge(both)
 
 
 def test_a_run_of_two_step_limits_is_refused() -> None:
