@@ -599,6 +599,24 @@ def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(
     assert detail in training_details(methods, [run])
 
 
+def test_a_submission_knows_a_checkpoint_whose_number_was_written_as_a_text() -> None:
+    methods = aggregate(records("a", {"BinFill": [1] * 4, "MoveCube": [1] * 4}), SMALL).methods
+    facts = policy_facts({"memory": {"name": "ttt"}})
+    run = {"settings": {"model": "a", "checkpoint": "100"}, "notes": {"policy": facts}}
+    assert "policy: memory ttt" in training_details(methods, [run])
+    run["notes"] = {"policy": policy_facts({"served": {"model": "a"}})}
+    assert "no memory" not in training_details(methods, [run])
+
+
+def test_two_models_of_one_shipped_checkpoint_are_told_apart() -> None:
+    made = []
+    for name in ("framesamp_modul", "mine"):
+        made += records(name, {"VideoUnmask": [1]}, checkpoint="nano")
+    results = aggregate(made, Protocol.of_records(made))
+    assert [method.label for method in results.methods] == ["nano#framesamp_modul", "nano#mine"]
+    assert results.notes[0].startswith("2 different models are called nano")
+
+
 HOSTILE = "\x1b]0;title\x07\x1b[2J"
 
 
