@@ -190,6 +190,13 @@ def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
 
 
+def test_a_run_of_compressed_records_is_not_run_again(tmp_path: Path) -> None:
+    claim_run(tmp_path, {"a": 1})
+    (tmp_path / "episodes.jsonl.xz").write_bytes(b"")
+    with pytest.raises(UserError, match=r"episodes\.jsonl\.xz is compressed.*unpack it"):
+        claim_run(tmp_path, {"a": 1})
+
+
 def test_a_folder_of_something_else_is_not_filled_with_records(tmp_path: Path) -> None:
     for name in ("new", "empty", "run", "records", "begun", "foreign"):
         (tmp_path / name).mkdir()
