@@ -3,8 +3,10 @@ killed.
 """
 
 import errno
+import fcntl
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -72,6 +74,15 @@ def test_no_draft_is_written_where_another_claim_is_there(
         assert taken(first.take(JOBS[:1])) == 0
         monkeypatch.setattr(store, "_write_new", lambda path, text: pytest.fail("was written"))
         assert second.take(JOBS[:1]) is None
+
+
+def test_a_process_starts_while_another_looks_whether_it_is_alive(tmp_path: Path) -> None:
+    path = tmp_path / "episodes-0of2.jsonl"
+    path.touch()
+    with path.open("rb") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)  # as `Claims` does, for a moment
+        threading.Timer(0.1, looking.close).start()
+        RecordLog(path).close()
 
 
 @pytest.mark.slow
