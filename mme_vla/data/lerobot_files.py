@@ -337,7 +337,14 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
     for episode, start in rows:
         if not all(type(number) is int and 0 <= number < 2**40 for number in (episode, start)):
             raise UserError(f"{file} says {brief(start)} of episode {brief(episode)}. {expected}")
-    table = dict(rows)
+    table: dict[int, int] = {}
+    for episode, start in rows:
+        require(
+            table.get(episode, start) == start,
+            f"{file} gives episode {episode} two first execution frames, {table.get(episode)} and"
+            f" {start}. Keep the right one.",
+        )
+        table[episode] = start
     missing = [episode for episode in range(episodes) if episode not in table]
     require(
         not missing,

@@ -306,6 +306,57 @@ def test_both_marks_of_a_conditioning_video_must_agree(tmp_path: Path) -> None:
         EpisodeSource(root)
 
 
+def add_flag(root: Path, name: str, values: list) -> None:
+    change(root, ROWS, name, values)
+    feature = {"dtype": "int64", "shape": [1], "names": None}
+    change_info(root, lambda info: info["features"].update({name: feature}))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        (
+            "exec_start_idx",
+            [1, 1, 3, 1, 1, 0, 0, 0, 0],
+            "exec_start_idx 3, but 1 at the first",
+        ),
+        ("is_demo", [1, 0, 0, 0, 0, 1, 2, 0, 0], r"frame 1 of episode 1, has is_demo 2"),
+        ("is_demo", [-1, 1, 0, 0, 0, 0, 0, 0, 0], r"frame 0 of episode 0, has is_demo -1"),
+        ("top_drawn", [1, 1, 1, 1, 1, 1, 1, 1, 3], r"frame 3 of episode 1, has top_drawn 3"),
+    ],
+)
+def test_a_flag_says_one_thing_of_an_episode(tmp_path: Path, name, values, words) -> None:
+    add_flag(write_dataset(tmp_path), name, values)
+    with pytest.raises(UserError, match=words):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("is_demo", [1, 1, 0, 0, 0, 0, 0, 0, 0]), ("exec_start_idx", [2, 2, 2, 2, 2, 0, 0, 0, 0])],
+)
+def test_a_side_file_of_first_execution_frames_must_agree_with_the_tables(
+    tmp_path: Path, name, values
+) -> None:
+    add_flag(write_dataset(tmp_path / "data"), name, values)
+    starts = tmp_path / "starts.json"
+    starts.write_text('{"0": 2, "1": 0}')
+    source = EpisodeSource(tmp_path / "data", starts, robot=custom_robot())
+    assert source.exec_starts.tolist() == [2, 0]
+    starts.write_text('{"0": 2, "1": 3}')
+    with pytest.raises(UserError, match=r"episode 1 starts execution at frame 3, but .* at 0"):
+        EpisodeSource(tmp_path / "data", starts, robot=custom_robot())
+
+
+def test_a_side_file_names_one_first_execution_frame_an_episode(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data")
+    (tmp_path / "starts.json").write_text('{"0": 4, "1": 1, "00": 2}')
+    table(tmp_path / "starts.parquet", {"episode_index": [0, 1, 0], "exec_start_idx": [4, 1, 2]})
+    for name in ("starts.json", "starts.parquet"):
+        with pytest.raises(UserError, match="episode 0 two first execution frames, 4 and 2"):
+            EpisodeSource(tmp_path / "data", tmp_path / name, robot=custom_robot())
+
+
 def test_other_statistics_than_the_rows_have_are_a_warning(tmp_path: Path, caplog) -> None:
     write_dataset(tmp_path)
     stats = {"action": {"min": [-9.0] * 3, "max": [9.0] * 3}}
