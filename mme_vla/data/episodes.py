@@ -492,12 +492,16 @@ class EpisodeSource:
             marked = rows["exec_start_idx"][self._starts]
         if side_file is not None:
             starts = read_exec_starts(side_file, len(self))
-            episode = None if marked is None else first_wrong(starts != marked)
+            expected = starts
+            if marked is not None:
+                expected = marked
+            episode = first_wrong(starts != expected)
             if episode is not None:
                 raise UserError(
                     f"{side_file}: episode {episode} starts execution at frame {starts[episode]},"
-                    f" but by the tables of {self.root} at {marked[episode]}. Correct the one that"
-                    " is wrong; a dataset that marks its conditioning videos needs no side file."
+                    f" but by the tables of {self.root} at {expected[episode]}. Correct the one"
+                    " that is wrong; a dataset that marks its conditioning videos needs no side"
+                    " file."
                 )
         elif marked is not None:
             starts = marked

@@ -221,7 +221,7 @@ def read_training(folder: Path) -> Training:
     run = read_run(folder)
     text = read_text(folder / CONFIG, "a composed configuration")
     with decoding(folder / CONFIG, "a composed configuration", "Copy it again."):
-        config = OmegaConf.to_container(OmegaConf.create(text))
+        config: Any = OmegaConf.to_container(OmegaConf.create(text))
     require(
         isinstance(config, Mapping),
         f"{folder / CONFIG} must hold sections of keys, not {brief(config)}.",
