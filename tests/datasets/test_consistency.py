@@ -41,6 +41,7 @@ from mme_vla.data.lerobot_files import (
     parquet_files,
 )
 from mme_vla.data.sources import open_sources
+from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError
 
 TASKS = ("open the drawer", "close the drawer")
@@ -365,6 +366,51 @@ def test_other_statistics_than_the_rows_have_are_a_warning(tmp_path: Path, caplo
     assert "number 1 of action lies within -9 and 9, in the rows within" in caplog.text
 
 
+# Columns and sources
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (
+            lambda robot: robot["cameras"].update(side={"key": CAMERA}),
+            r"top would be read as the camera 'top' and as the camera 'side' of the robot",
+        ),
+        (
+            lambda robot: robot["state"].update(key="action"),
+            r"action would be read as the state and as the action",
+        ),
+        (
+            lambda robot: robot["action"].update(key=["action", "action"], width=6),
+            r"action would be read as the action and as the action",
+        ),
+    ],
+)
+def test_a_column_is_read_once(tmp_path: Path, edit, words: str) -> None:
+    section = custom_robot().to_dict()
+    section["action"].update(names=None, units=None)
+    edit(section)
+    with pytest.raises(UserError, match=words):
+        EpisodeSource(write_dataset(tmp_path), robot=Embodiment.from_dict(section))
+
+
+def test_numbers_in_a_column_of_flags_are_not_taken_for_one(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    change_info(tmp_path, lambda info: info["features"]["action"].update(dtype="bool"))
+    with pytest.raises(UserError, match=r"action is bool in meta/info.json, .* holds .*float"):
+        opened(tmp_path)
+
+
+def test_two_sources_of_one_content_are_a_warning(tmp_path: Path, caplog) -> None:
+    write_dataset(tmp_path / "one")
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    write_dataset(tmp_path / "three", tasks=TASKS[::-1])
+    open_sources([str(tmp_path / "one"), str(tmp_path / "three")], custom_robot())
+    assert not caplog.text
+    open_sources([str(tmp_path / name) for name in ("one", "two")], custom_robot())
+    assert "The sources one and two hold the same episodes" in caplog.text
+
+
 # Videos
 
 
@@ -532,7 +578,7 @@ def test_the_same_names_in_another_order_are_refused_and_other_names_named(
 ) -> None:
     names = ["shoulder", "elbow", "gripper"]
     roots = [
-        write_dataset(tmp_path / str(i), names=other)
+        write_dataset(tmp_path / str(i), names=other, tasks=(f"take {i}", "put it back"))
         for i, other in enumerate(
             (names, ["elbow", "shoulder", "gripper"], {"motors": names}, ["hip", "knee", "toe"])
         )
