@@ -108,6 +108,7 @@ class RawEpisode:
     def __init__(self, ref: EpisodeRef, group: Any) -> None:
         self.ref = ref
         self._group = group
+        self._shape: tuple[int, ...] = ()  # of its images, once one was read
         steps = []
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
             for name in group:
@@ -196,11 +197,19 @@ class RawEpisode:
                 f"{self.ref.file} {self.ref.group}: {camera} was not rendered at step {step}; the"
                 f" episode was recorded with frames={self.frames.get('at')}."
             )
-        return self._checked(
+        image = self._checked(
             f"timestep_{step}/{_IMAGE_KEYS[camera]}",
             lambda x: x.dtype == np.uint8 and x.ndim == 3 and x.shape[-1] == 3,
             "uint8 [height, width, 3]",
         )
+        self._shape = self._shape or image.shape
+        require(
+            image.shape == self._shape,
+            f"{self.ref.file} {self.ref.group}: the image of {camera!r} at step {step} is"
+            f" {list(image.shape)}, the one read first {list(self._shape)}. All images of a dataset"
+            f" have one size. {REMEDY}",
+        )
+        return image
 
     @property
     def goals(self) -> list[str]:
@@ -372,20 +381,12 @@ class RawEpisode:
                 f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}",
             )
             latest[camera] = self._image(int(rendered.argmax()), camera)
-        shape = latest[CAMERAS[0]].shape
         for k, subgoals in enumerate(self.subgoals()):
             joints = self._numbers(k, "obs/joint_state", 7)
             fingers = self._numbers(k, "obs/gripper_state", 1)
             now = frozenset(camera for camera, rendered in self.rendered.items() if rendered[k])
             for camera in now:
                 latest[camera] = self._image(k, camera)
-            for camera, image in latest.items():
-                require(
-                    image.shape == shape,
-                    f"{self.ref.file} {self.ref.group}: the image of {camera!r} at step {k} is"
-                    f" {list(image.shape)}, the first one of {CAMERAS[0]!r} {list(shape)}. All"
-                    f" images of a dataset have one size. {REMEDY}",
-                )
             yield RawFrame(
                 **latest,
                 rendered=now,

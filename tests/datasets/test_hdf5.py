@@ -114,7 +114,7 @@ WAYPOINT = "timestep_8/action/waypoint_action"
         (choice("A", -4, 9999), "timestep_4/action/choice_action: .* and pixels to 256"),
         (
             replaced("timestep_5/obs/wrist_rgb", np.zeros((4, 4, 3), np.uint8)),
-            r"'wrist' at step 5 is \[4, 4, 3\], the first one of 'front' \[16, 16, 3\]",
+            r"'wrist' at step 5 is \[4, 4, 3\], the one read first \[16, 16, 3\]",
         ),
     ],
 )
