@@ -17,7 +17,7 @@ import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 from mme_vla.utils import Sums, decoding, files_to_hold, read_json, require_file, user_cache
 
@@ -179,6 +179,15 @@ class VisionCache:
         if episode in self._verified:
             return
         sums = Sums(self.folder, sum_file(self.folder, episode).name, self._remedy)
+        read = [token_file(self.folder, episode).name]
+        if self.spec.scorer:
+            read.append(score_file(self.folder, episode).name)
+        unlisted = [name for name in read if name not in sums.table]
+        require(
+            not (sums.there and unlisted),
+            f"{self.folder / sums.name} is damaged: it does not list {listed(unlisted)}."
+            f" {self._remedy}",
+        )
         sums.check(*sums.table)
         self._verified.add(episode)
 
@@ -217,10 +226,11 @@ class VisionCache:
             and values.dtype == np.float32
             and values.shape == (len(frames), patches)
             and ((frames >= 0) & (frames < length)).all()
+            and (np.diff(frames) > 0).all()
             and np.isfinite(values).all(),
             f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames"
-            f" {list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below"
-            f" {length} are expected. {self._remedy}",
+            f" {list(frames.shape)}, where finite float32 [n, {patches}] of ascending int64 [n]"
+            f" frames below {length} are expected. {self._remedy}",
         )
         return FrameScores(frames, values)
 

@@ -81,14 +81,18 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
     _check(source, name, key, values.is_null().to_numpy(zero_copy_only=False), "has no value")
     if nested:
         sizes = pc.list_value_length(values).to_numpy(zero_copy_only=False)
-        width = int(np.bincount(sizes).argmax())
+        width = max(int(np.bincount(sizes).argmax()), 1)
         _check(source, name, key, sizes != width, f"does not hold {width} numbers")
-        flat = values.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)
-        numbers = flat.astype(np.float32).reshape(-1, width)
+        exact = values.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
     else:
-        numbers = values.cast(pa.float64()).to_numpy(zero_copy_only=False).astype(np.float32)
+        exact = values.to_numpy(zero_copy_only=False)
+    numbers = exact.astype(np.float32)
     wrong = ~np.isfinite(numbers)
     _check(source, name, key, wrong.any(1) if nested else wrong, "is missing or not finite")
+    if pa.types.is_integer(kind):
+        lost = numbers.astype(np.float64) != exact
+        problem = "holds a whole number that float32 cannot (beyond 2**24)"
+        _check(source, name, key, lost.any(1) if nested else lost, problem)
     return numbers
 
 
@@ -100,6 +104,11 @@ def weight_column(source: EpisodeSource, name: str) -> np.ndarray:
         f"data.weights: the column {name!r} of {source.name} needs one number a frame.",
     )
     _check(source, name, "data.weights", weights < 0, "is negative")
+    require(
+        weights.any(),
+        f"data.weights: the column {name!r} of {source.name} is 0 at every frame (float32): nothing"
+        " would be learned from it. Leave the dataset out, or correct the column.",
+    )
     return weights
 
 
@@ -107,15 +116,37 @@ def _read(source: EpisodeSource, name: str, key: str) -> Any:
     files = parquet_files(source.root, "data")
     schemas = [set(pq.read_schema(file).names) for file in files]
     check_known(f"column of {source.name} ({key})", name, set.intersection(*schemas))
-    return pa.concat_tables([pq.read_table(file, columns=[name]) for file in files])[name]
+    tables = [pq.read_table(file, columns=[name]) for file in files]
+    kinds = {str(table.schema.field(name).type) for table in tables}
+    require(
+        len(kinds) == 1,
+        f"{key}: the column {name!r} of {source.name} holds {' and '.join(sorted(kinds))} in"
+        " different files of data/. Write it with one type.",
+    )
+    return pa.concat_tables(tables)[name]
+
+
+def text_column(source: EpisodeSource, name: str, key: str) -> Any:
+    """A column of texts of a dataset, [rows] of arrow.
+
+    Raises:
+        UserError: no such column, another kind, or a text that is missing or empty; it names the
+            episode.
+    """
+    texts = _read(source, name, key).combine_chunks()
+    require(
+        pa.types.is_string(texts.type) or pa.types.is_large_string(texts.type),
+        f"{key}: the column {name!r} of {source.name} holds {texts.type}, no texts.",
+    )
+    is_empty = pc.equal(pc.utf8_length(pc.utf8_trim_whitespace(texts)), 0).fill_null(True)
+    _check(source, name, key, is_empty.to_numpy(zero_copy_only=False), "has no text")
+    return texts
 
 
 def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
     """The first frames of sub-tasks, [rows] float32: where the text of `simple_subgoal` changes."""
-    name = "simple_subgoal"
-    key = f"the label {label}"
     try:
-        subgoals = _read(source, name, key)
+        subgoals = text_column(source, "simple_subgoal", f"the label {label}")
     except UserError as error:
         if not (source.root / FACTS).is_file():
             raise
@@ -123,12 +154,7 @@ def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
             f"{error} {source.name} has facts: the label {FACT} counts them"
             f" (memory.label={FACT} for memory=keyframes)."
         ) from None
-    require(
-        pa.types.is_string(subgoals.type) or pa.types.is_large_string(subgoals.type),
-        f"{key}: the column {name!r} of {source.name} holds {subgoals.type}, no texts.",
-    )
-    _check(source, name, key, subgoals.is_null().to_numpy(zero_copy_only=False), "has no value")
-    codes = subgoals.combine_chunks().dictionary_encode().indices.to_numpy()
+    codes = subgoals.dictionary_encode().indices.to_numpy()
     begins = np.concatenate([[True], np.diff(codes) != 0])
     begins[np.cumsum(source.lengths) - source.lengths] = True
     return begins.astype(np.float32)
@@ -152,19 +178,35 @@ def _facts(source: EpisodeSource, key: str) -> tuple[np.ndarray, np.ndarray]:
         path.is_file(),
         f"{key}: {source.name} has no {FACTS}. `mme-vla record` writes it with a dataset.",
     )
+    kinds = {"episode": np.int64, "from": np.int64, "to": np.int64, "task": str, "fact": str}
     try:
-        table = pd.read_csv(path, usecols=["episode", "from", "to"], dtype=np.int64)
+        table = pd.read_csv(path, usecols=list(kinds), dtype=kinds, keep_default_na=False)
     except (ValueError, OverflowError) as error:
         raise UserError(f"{key}: {path} is no table of facts: {brief(error)}.") from None
     begins = np.zeros(source.lengths.sum(), np.float32)
     is_visible = np.zeros_like(begins)
     starts = np.cumsum(source.lengths) - source.lengths
-    for line, (episode, first, last) in enumerate(table.itertuples(index=False), start=2):
+    shown: dict[tuple[int, str], list[tuple[int, int]]] = {}
+    rows = table[list(kinds)].itertuples(index=False)
+    for line, (episode, first, last, task, fact) in enumerate(rows, start=2):
         require(
             0 <= episode < len(source.lengths) and 0 <= first <= last < source.lengths[episode],
             f"{key}: line {line} of {path} has a fact at frames {first} to {last} of episode"
             f" {episode}, which {source.name} does not have. Record the dataset again.",
         )
+        known = source.task(episode)
+        require(
+            not known or task == known,
+            f"{key}: line {line} of {path} is of the task {brief(task)}; episode {episode} of"
+            f" {source.name} is one of {known}. Record the dataset again.",
+        )
+        earlier = shown.setdefault((episode, fact), [])
+        require(
+            not any(first <= end and begin <= last for begin, end in earlier),
+            f"{key}: line {line} of {path} has the fact {brief(fact)} at frames {first} to {last}"
+            f" of episode {episode}, where an earlier line has it too. Record the dataset again.",
+        )
+        earlier.append((first, last))
         begins[starts[episode] + first] += 1
         is_visible[starts[episode] + first : starts[episode] + last + 1] = 1
     return begins, is_visible

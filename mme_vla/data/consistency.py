@@ -26,6 +26,7 @@ from mme_vla.data.image_consistency import (
 )
 from mme_vla.data.lerobot_files import (
     REMEDY,
+    RENDERED_SUFFIX,
     SIDE_FILE,
     TASKS,
     read_records,
@@ -169,17 +170,31 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
 
 
 def _check_phases(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
-    """Compare the two columns that say where a conditioning video ends."""
-    if not {"exec_start_idx", "is_demo"} <= set(rows):
+    """Compare the two columns that say where a conditioning video ends, each with itself too."""
+    for name, values in rows.items():
+        if name != "is_demo" and not name.endswith(RENDERED_SUFFIX):
+            continue
+        row = first_wrong((values != 0) & (values != 1))
+        if row is not None:
+            raise UserError(
+                f"{dataset.root}: {dataset.place(row)}, has {name} {values[row]}; expected true or"
+                f" false. {REMEDY}"
+            )
+    if "exec_start_idx" not in rows:
         return
     declared = rows["exec_start_idx"]
-    counted = np.repeat(np.add.reduceat(rows["is_demo"], dataset.starts), dataset.lengths)
-    row = first_wrong(declared != counted)
+    if "is_demo" in rows:
+        counts = np.add.reduceat(rows["is_demo"], dataset.starts)
+        other = "is_demo marks the first {} frames of the episode as its conditioning video"
+    else:
+        counts = declared[dataset.starts]
+        other = "{} at the first frame of the episode, which has one such number"
+    expected = np.repeat(counts, dataset.lengths)
+    row = first_wrong(declared != expected)
     if row is not None:
         raise UserError(
-            f"{dataset.root}: {dataset.place(row)}, has exec_start_idx {declared[row]}, but is_demo"
-            f" marks the first {counted[row]} frames of the episode as its conditioning video."
-            f" {CORRECT}"
+            f"{dataset.root}: {dataset.place(row)}, has exec_start_idx {declared[row]}, but"
+            f" {other.format(expected[row])}. {CORRECT}"
         )
 
 

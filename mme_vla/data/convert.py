@@ -253,7 +253,14 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
             sums[file] = file_sum(file)
             advance(file.stat().st_size)
     origins = []
+    first: dict[tuple[str, int], EpisodeRef] = {}
     for ref in episodes:
+        same = first.setdefault((sums[ref.file], ref.index), ref)
+        require(
+            same is ref,
+            f"{same.file} and {ref.file} are copies of one file: {ref.group} would be in the"
+            " dataset twice. Name one of them.",
+        )
         size = ref.file.stat().st_size
         origins.append(
             {"file": ref.file.name, "bytes": size, "sha256": sums[ref.file], "episode": ref.index}

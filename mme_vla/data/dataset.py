@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.data.cache import VisionCache
-from mme_vla.data.columns import label_column, weight_column, with_labels
+from mme_vla.data.columns import label_column, text_column, weight_column, with_labels
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory
@@ -170,6 +170,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
                     f" subgoal_text.kind={subgoal.kind} reads; its subgoal texts are:"
                     f" {', '.join(source.subgoal_names) or 'none'}.",
                 )
+                for name in subgoal.columns:
+                    text_column(source, name, f"subgoal_text.kind={subgoal.kind}")
         rate = processor.embodiment.fps
         if processor.samples.history is not None and rate is not None:
             for source in sources:

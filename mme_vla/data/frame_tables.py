@@ -89,6 +89,7 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
     tells them by path and time stamp, which copies and archives may keep while the content is
     another.
     """
+    import pyarrow.parquet as pq
     from lerobot.utils.utils import SuppressProgressBars
 
     from datasets import Dataset, Features
@@ -97,6 +98,17 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
         target = Features({name: _kind(features[name]) for name in columns})
     large = any(features[name].dtype == "image" for name in columns)
     files = parquet_files(root, "data")
+    # Every number but 0 would become true without a word.
+    flags = [name for name in columns if features[name].dtype == "bool"]
+    for file in files:
+        for name in flags:
+            with decoding(file, "a table of frames", REMEDY):
+                kind = str(pq.read_schema(file).field(name).type)
+            require(
+                "bool" in kind,
+                f"{root}: {name} is bool in meta/info.json, but {file.name} holds {kind}. Correct"
+                " the one that is wrong.",
+            )
     # A digest of all content, or, where images make it large, of its fingerprint and the times of
     # change (ctime), which the system sets whenever content is written; no program can keep them.
     digest = sha256()

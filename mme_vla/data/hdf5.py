@@ -108,6 +108,7 @@ class RawEpisode:
     def __init__(self, ref: EpisodeRef, group: Any) -> None:
         self.ref = ref
         self._group = group
+        self._shape: tuple[int, ...] = ()  # of its images, once one was read
         steps = []
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
             for name in group:
@@ -163,15 +164,18 @@ class RawEpisode:
             raise UserError(f"{self._path(name)} holds {value}; expected {expected}. {REMEDY}")
         return array
 
-    def _numbers(self, step: int, name: str, count: int, finite: bool = True) -> np.ndarray:
-        expected = f"at least {count} numbers"
-        if finite:
-            expected = f"at least {count} finite numbers"
+    def _numbers(self, step: int, name: str, count: int, absent: bool = False) -> np.ndarray:
+        """The first `count` numbers of a step's array; with `absent` all of them may be NaN."""
+        expected = f"at least {count} finite numbers within float32"
+        if absent:
+            expected += ", or NaN alone"
 
         def is_valid(numbers: np.ndarray) -> bool:
             if numbers.ndim > 1 or numbers.size < count:
                 return False
-            return not finite or bool(np.isfinite(numbers).all())
+            with np.errstate(over="ignore"):
+                is_finite = np.isfinite(numbers.astype(np.float32)).all()
+            return bool(is_finite or (absent and np.isnan(numbers).all()))
 
         numbers = self._checked(f"timestep_{step}/{name}", is_valid, expected)
         return np.atleast_1d(numbers)[:count]
@@ -191,13 +195,21 @@ class RawEpisode:
         if self.frames is not None and not self.rendered[camera][step]:
             raise UserError(
                 f"{self.ref.file} {self.ref.group}: {camera} was not rendered at step {step}; the"
-                f" episode was recorded with frames={self.frames['at']}."
+                f" episode was recorded with frames={self.frames.get('at')}."
             )
-        return self._checked(
+        image = self._checked(
             f"timestep_{step}/{_IMAGE_KEYS[camera]}",
             lambda x: x.dtype == np.uint8 and x.ndim == 3 and x.shape[-1] == 3,
             "uint8 [height, width, 3]",
         )
+        self._shape = self._shape or image.shape
+        require(
+            image.shape == self._shape,
+            f"{self.ref.file} {self.ref.group}: the image of {camera!r} at step {step} is"
+            f" {list(image.shape)}, the one read first {list(self._shape)}. All images of a dataset"
+            f" have one size. {REMEDY}",
+        )
+        return image
 
     @property
     def goals(self) -> list[str]:
@@ -205,7 +217,11 @@ class RawEpisode:
         with decoding(self._path("setup/task_goal"), "texts", REMEDY):
             goals = np.atleast_1d(self._value("setup/task_goal"))
             first, *others = [_decode(goal).lower() for goal in goals]
-            return [first, *others]
+        require(
+            first.strip(),
+            f"{self._path('setup/task_goal')} is empty, and a policy is told what to do in words.",
+        )
+        return [first, *others]
 
     @property
     def seed(self) -> int | None:
@@ -269,9 +285,17 @@ class RawEpisode:
         it ends.
         """
         name = POSE_ACTIONS[column]
-        steps = [self._numbers(k, name, 7, finite=False) for k in range(self.length)]
+        steps = np.stack([self._numbers(k, name, 7, absent=True) for k in range(self.length)])
+        is_known = np.isfinite(steps).all(1)
+        goes_on = is_known[:-1] & ~is_known[1:]
+        goes_on[self.exec_start - 1 : self.exec_start] = False  # the execution begins anew
+        require(
+            not goes_on.any(),
+            f"{self._path(f'timestep_{goes_on.argmax() + 1}/{name}')} holds NaN after a step that"
+            f" has a pose. {REMEDY}",
+        )
         return known_poses(
-            np.stack(steps),
+            steps,
             self.exec_start,
             lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7),
         )
@@ -293,7 +317,7 @@ class RawEpisode:
             if begins or k == self.exec_start:
                 name = f"timestep_{k}/action/choice_action"
                 with self._reported_at(name):
-                    row = row_of(self._text(name))
+                    row = row_of(self._text(name), self.options)
                 if row is not None:
                     rows[k] = row
         return rows
@@ -377,7 +401,10 @@ def _is_finite_array(array: np.ndarray, size: int) -> bool:
     return array.size == size and bool(np.isfinite(array).all())
 
 
-def _decode(value: bytes | str) -> str:
+def _decode(value: Any) -> str:
+    # Numbers would be read as the characters that their bytes are.
+    if not isinstance(value, bytes | str):
+        raise TypeError(f"a text is expected, not {brief(value)}")
     return value if isinstance(value, str) else str(value, "utf-8")
 
 
@@ -424,10 +451,14 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
         `poses`: the columns of `POSE_ACTIONS` that all episodes have. `tool_pose`, `choices`:
         whether all have the tool's poses, options and choices. `partly`: whether one of them has
         images of selected frames alone.
+
+    Raises:
+        UserError: two episodes have images of different sizes.
     """
     poses = list(POSE_ACTIONS)
     tool_pose = choices = True
     partly = False
+    first: dict[str, Any] = {}
     groups: dict[Path, list[str]] = {}
     for ref in refs:
         groups.setdefault(ref.file, []).append(ref.group)
@@ -439,6 +470,15 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
                 tool_pose &= f"{step}/obs/{POSE_STATE}" in handle
                 choices &= all(f"{group}/{name}" in handle for name in CHOICES)
                 partly |= f"{group}/{FRAMES}" in handle
+                image = handle.get(f"{step}/{_IMAGE_KEYS[CAMERAS[0]]}")
+                if image is not None:
+                    first = first or {"shape": image.shape, "place": f"{file} {group}"}
+                    require(
+                        image.shape == first["shape"],
+                        f"{file} {group} has images {list(image.shape)}, {first['place']}"
+                        f" {list(first['shape'])}. All images of a dataset have one size: convert"
+                        " them into two.",
+                    )
     return {"poses": tuple(poses), "tool_pose": tool_pose, "choices": choices, "partly": partly}
 
 

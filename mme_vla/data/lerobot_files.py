@@ -175,6 +175,18 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     action = tuple(columns[key] for key in robot.action.key or ("action",))
     pose = tuple(columns[key] for key in robot.action.pose_key)
     vectors = [("state", state, robot.state.width), ("action", action, robot.action.width)]
+    read_as: dict[str, str] = {}
+    read = [(column, f"the camera {name!r}") for name, column in cameras.items()]
+    read += [(column, "the state") for column in state]
+    read += [(column, "the action") for column in action]
+    for column, what in read:
+        require(
+            column not in read_as,
+            f"{root}: {column} would be read as {read_as.get(column)} and as {what} of the robot"
+            f" {robot.name!r}. Each has a column of its own: correct its key in the section"
+            " embodiment.",
+        )
+        read_as[column] = what
     if pose:
         vectors.append(("tool's pose", pose, POSE_WIDTH))
     for what, names, width in vectors:
@@ -337,7 +349,14 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
     for episode, start in rows:
         if not all(type(number) is int and 0 <= number < 2**40 for number in (episode, start)):
             raise UserError(f"{file} says {brief(start)} of episode {brief(episode)}. {expected}")
-    table = dict(rows)
+    table: dict[int, int] = {}
+    for episode, start in rows:
+        require(
+            table.get(episode, start) == start,
+            f"{file} gives episode {episode} two first execution frames, {table.get(episode)} and"
+            f" {start}. Keep the right one.",
+        )
+        table[episode] = start
     missing = [episode for episode in range(episodes) if episode not in table]
     require(
         not missing,

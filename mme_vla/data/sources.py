@@ -171,6 +171,14 @@ def open_sources(
                 " into the other's order.",
             )
             _compare_scales(first, second, kind)
+        is_copy = np.array_equal(first.lengths, second.lengths)
+        if is_copy and first.fingerprint == second.fingerprint:
+            log.warning(
+                "The sources %s and %s hold the same episodes: what is held out of one may be"
+                " trained on in the other.",
+                first.name,
+                second.name,
+            )
         if first.fps != second.fps:
             log.warning(
                 "The source %s has %g frames per second, %s has %g: one step of a chunk is another"

@@ -1,13 +1,13 @@
 """Episodes as a sequence of planned motions: where each was decided, and where it was to end."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment.robomme import CHOICE_SPACE, LETTERS, choice_action
-from mme_vla.errors import UserError, brief
+from mme_vla.embodiment.robomme import CHOICE_SPACE, LETTERS, SIDE, choice_action
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import parse_json
 
 
@@ -91,22 +91,36 @@ CHOICE_NUMBERS = [*(f"choice_{letter}" for letter in LETTERS), "point_y", "point
 """A row of the column: at the frame where what was chosen began; all zeros at every other."""
 
 
-def row_of(text: str) -> np.ndarray | None:
+def row_of(text: str, options: Sequence[Mapping[str, Any]] | None = None) -> np.ndarray | None:
     """A recorded choice, `{"choice": "A", "point": [y, x]}` in pixels, as a row; None where no
     letter was chosen.
+
+    Args:
+        options: what the episode offers, each with `label` and `need_parameter`; None where that
+            is not known.
     """
     try:
         choice = parse_json(text, "a recorded choice")
         letter = choice["choice"].strip().lower()
         point = np.asarray(choice.get("point") or (), np.float64)
-        is_valid = point.shape in ((0,), (2,)) and bool(np.isfinite(point).all())
+        is_valid = point.shape in ((0,), (2,)) and bool(((point >= 0) & (point <= SIDE)).all())
     except (UserError, ValueError, TypeError, KeyError, AttributeError):
         is_valid = False
     if not is_valid or letter not in ("", *LETTERS):
         raise UserError(
             f'{brief(text)} is no choice; expected {{"choice": "A", "point": [y, x]}}, letters A'
-            " to H."
+            f" to H and pixels to {SIDE}."
         )
     if not letter:
         return None
+    if options is not None:
+        needs_point = {str(option["label"]): option["need_parameter"] for option in options}
+        require(
+            letter in needs_point,
+            f"{brief(text)} chooses {letter!r}, but the episode offers {listed(needs_point)}.",
+        )
+        require(
+            len(point) or not needs_point[letter],
+            f"{brief(text)} has no point, which the option {letter!r} needs.",
+        )
     return choice_action(CHOICE_SPACE, {"choice": letter, "point": point.tolist()})

@@ -23,7 +23,8 @@ from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import name_place, parse_json, read_lines, to_line, verified
 
 Integer = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
-Number = Annotated[float, Range(-(2.0**63), 2.0**63)]
+Count = Annotated[int, Range(0, 2**63)]
+Duration = Annotated[float, Range(0, 2.0**63)]
 OUTCOMES = ("success", "fail", "timeout", "error")
 
 
@@ -115,17 +116,17 @@ class Seconds:
     total: from its beginning to its end, waiting included.
     """
 
-    sim: Number = 0.0
-    policy: Number = 0.0
-    total: Number = 0.0
-    render: Number = 0.0
+    sim: Duration = 0.0
+    policy: Duration = 0.0
+    total: Duration = 0.0
+    render: Duration = 0.0
 
 
 class EventEntry(TypedDict):
     """An event of an episode, and the control step at which it acted; None where it did not."""
 
     event: str
-    step: Integer | None
+    step: Count | None
 
 
 @dataclass(frozen=True)
@@ -177,15 +178,15 @@ class EpisodeRecord:
     checkpoint: Integer | str
     model_seed: Integer
     task: str
-    episode: Integer
+    episode: Count
     seed: Integer
     difficulty: str
     outcome: str
-    steps: Integer
+    steps: Count
     seconds: Seconds = field(default_factory=Seconds)
     error: str | None = None
     split: str = "test"
-    max_steps: Integer = DEFAULT_STEPS
+    max_steps: Count = DEFAULT_STEPS
     action_space: str = "joint_angle"
     subgoal: str | None = None
     memory_budget: Integer | None = None
@@ -198,8 +199,8 @@ class EpisodeRecord:
     _: KW_ONLY
     env: str | None = None
     goal: str | None = None
-    chunks: Integer | None = None
-    video_frames: Integer | None = None
+    chunks: Count | None = None
+    video_frames: Count | None = None
     actions_sha256: str | None = None
     suite: str | None = None
     groups: Mapping[str, str] | None = None
@@ -430,6 +431,8 @@ def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]
             of_one.setdefault(("action_space", ""), set()).add(member.action_space)
             # Tasks of other environments may have limits of their own.
             scope = "" if member.env in (None, ROBOMME) else member.task
+            if member.env is not None:
+                of_one.setdefault(("env", member.task), set()).add(member.env)
             of_one.setdefault(("max_steps", scope), set()).add(member.max_steps)
         for (name, _), values in of_one.items():
             if len(values) > 1:

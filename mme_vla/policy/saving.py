@@ -33,7 +33,7 @@ from mme_vla.policy.tensor_files import (
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import weights_digest
 from mme_vla.registry import POLICIES
-from mme_vla.utils import checked_file, read_json, write_sums
+from mme_vla.utils import checked_file, read_json, to_json, write_sums
 
 if TYPE_CHECKING:
     from mme_vla.policy.base import Policy
@@ -386,7 +386,7 @@ def recompute_buffers(policy: "Policy") -> None:
 
 
 def check_processor(policy: "Policy", source: str) -> None:
-    """Make sure that a policy and its processor have the same robot and sizes."""
+    """Make sure that a policy and its processor have the same robot, settings and sizes."""
     processor = policy.require_processor()
     robot = embodiment_of(policy.config)
     if robot != processor.embodiment:
@@ -395,6 +395,17 @@ def check_processor(policy: "Policy", source: str) -> None:
             f" configuration of {brief(robot.name)}, or they describe it differently. The files are"
             " from two checkpoints, or one was changed."
         )
+    # Settings that both files hold; where the tokenizer lies is each one's own.
+    written = to_json(processor.to_config())
+    for name, expected in (policy.config.get("processor") or {}).items():
+        actual = written.get(name)
+        if name != "tokenizer" and actual is not None:
+            require(
+                expected in (None, actual),
+                f"{source}: the processor's {name} is {brief(actual)}, that of the configuration"
+                f" (processor.{name}) {brief(expected)}. The files are from two checkpoints, or one"
+                " was changed.",
+            )
     for name, expected in policy.info.processor_sizes.items():
         actual = attrgetter(name)(processor)
         require(

@@ -245,9 +245,9 @@ def assign_tensors(
     state = module.state_dict()
     check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in state.items()}, source)
     check_kinds(tensors, state, source)
-    check_values(tensors, source)
     trainable = {name: p.requires_grad for name, p in module.named_parameters()}
     in_dtype = {name: cast(tensor, dtype) for name, tensor in tensors.items()}
+    check_values(in_dtype, source)  # a number may be too large for the new kind
     module.load_state_dict(in_dtype, strict=True, assign=True)
     for name, parameter in module.named_parameters():
         parameter.requires_grad_(trainable[name])

@@ -208,12 +208,14 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
             averaged[name] = cast(averaged[name], torch.bfloat16)
     _check_fit(folder / "model.safetensors", averaged, state)
     _check_fit(folder / RAW, raw, parameters)
-    required = {}
+    # A parameter that never had a gradient has none of them.
+    moved = {name.rpartition("/")[0] for name in moments}
+    required: dict[str, Tensor] = {}
     for name, p in parameters.items():
-        for key in _ADAM:
-            if f"{name}/{key}" in moments:
-                required[f"{name}/{key}"] = p
-    _check_fit(folder / OPTIMIZER, moments, required, scalar="/step")
+        if name in moved:
+            required |= {f"{name}/{key}": p for key in MOMENTS}
+            required[f"{name}/step"] = torch.zeros(())
+    _check_fit(folder / OPTIMIZER, moments, required)
     for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
         check_values(tensors, str(path))
     ema.load(averaged)
@@ -246,6 +248,11 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
             f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older"
             " one."
         )
+    require(
+        step_of(checkpoint) in (step, -1),
+        f"{path} has step {step}, but its folder is called {checkpoint.name}. Give the folder the"
+        " name it had, or resume from another one.",
+    )
     shards = state.get("shards", 0)
     require(
         len(shard_files(checkpoint)) == shards,
@@ -323,13 +330,9 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise UserError(f"{error} Resume from an older checkpoint.") from None
 
 
-def _check_fit(
-    path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = ""
-) -> None:
+def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
     wrong = sorted(tensors.keys() ^ expected.keys())
     for name in sorted(tensors.keys() & expected.keys()):
-        if scalar and name.endswith(scalar):
-            continue
         tensor, target = tensors[name], expected[name]
         if tensor.shape != target.shape or tensor.dtype != target.dtype:
             wrong.append(f"{name}: {tuple(tensor.shape)} {tensor.dtype}")

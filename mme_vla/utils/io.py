@@ -327,11 +327,14 @@ def parse_json(
         source: where it came from, for the message.
         kind: what the outermost value must be.
         finite: whether NaN and infinities, which JSON does not have but Python writes, are refused.
+
+    Raises:
+        UserError: it is none, a key is twice in an object, or it holds another kind of value.
     """
+    hooks: dict[str, Any] = {"object_pairs_hook": _each_once}
     # Python's own constants are looked at only where they are refused: hooks slow the parser down.
-    hooks: dict[str, Any] = {}
     if finite:
-        hooks = {"parse_float": _finite, "parse_constant": _finite}
+        hooks |= {"parse_float": _finite, "parse_constant": _finite}
     try:
         value = json.loads(text, **hooks)
     except RecursionError:
@@ -431,6 +434,15 @@ def _crc(values: Mapping[str, Any]) -> str:
 def to_json(value: Any) -> Any:
     """`value` as JSON returns it: tuples are lists, keys are texts."""
     return json.loads(json.dumps(value))
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON, whose keys differ: of two values Python would take the last."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        twice = next(key for n, (key, _) in enumerate(pairs) if key in dict(pairs[:n]))
+        raise ValueError(f"the key {brief(twice)} is there twice")
+    return values
 
 
 def _finite(text: str) -> float:

@@ -16,6 +16,7 @@ from mme_vla.policy.saving import recompute_buffers
 from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import (
     assign_tensors,
+    cast,
     check_fit,
     check_kinds,
     check_values,
@@ -158,6 +159,7 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
         matched, left = _match_foreign(policy, checkpoint, str(source))
     state = policy.state_dict()
     check_kinds(matched, state, str(source))
+    matched = {name: cast(tensor, state[name].dtype) for name, tensor in matched.items()}
     check_values(matched, str(source))
     policy.load_state_dict(matched, strict=False)
     return Start(sorted(matched), sorted(set(state) - set(matched)), left)

@@ -41,6 +41,7 @@ from mme_vla.data.lerobot_files import (
     parquet_files,
 )
 from mme_vla.data.sources import open_sources
+from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError
 
 TASKS = ("open the drawer", "close the drawer")
@@ -306,12 +307,108 @@ def test_both_marks_of_a_conditioning_video_must_agree(tmp_path: Path) -> None:
         EpisodeSource(root)
 
 
+def add_flag(root: Path, name: str, values: list) -> None:
+    change(root, ROWS, name, values)
+    feature = {"dtype": "int64", "shape": [1], "names": None}
+    change_info(root, lambda info: info["features"].update({name: feature}))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        (
+            "exec_start_idx",
+            [1, 1, 3, 1, 1, 0, 0, 0, 0],
+            "exec_start_idx 3, but 1 at the first",
+        ),
+        ("is_demo", [1, 0, 0, 0, 0, 1, 2, 0, 0], r"frame 1 of episode 1, has is_demo 2"),
+        ("is_demo", [-1, 1, 0, 0, 0, 0, 0, 0, 0], r"frame 0 of episode 0, has is_demo -1"),
+        ("top_drawn", [1, 1, 1, 1, 1, 1, 1, 1, 3], r"frame 3 of episode 1, has top_drawn 3"),
+    ],
+)
+def test_a_flag_says_one_thing_of_an_episode(tmp_path: Path, name, values, words) -> None:
+    add_flag(write_dataset(tmp_path), name, values)
+    with pytest.raises(UserError, match=words):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("is_demo", [1, 1, 0, 0, 0, 0, 0, 0, 0]), ("exec_start_idx", [2, 2, 2, 2, 2, 0, 0, 0, 0])],
+)
+def test_a_side_file_of_first_execution_frames_must_agree_with_the_tables(
+    tmp_path: Path, name, values
+) -> None:
+    add_flag(write_dataset(tmp_path / "data"), name, values)
+    starts = tmp_path / "starts.json"
+    starts.write_text('{"0": 2, "1": 0}')
+    source = EpisodeSource(tmp_path / "data", starts, robot=custom_robot())
+    assert source.exec_starts.tolist() == [2, 0]
+    starts.write_text('{"0": 2, "1": 3}')
+    with pytest.raises(UserError, match=r"episode 1 starts execution at frame 3, but .* at 0"):
+        EpisodeSource(tmp_path / "data", starts, robot=custom_robot())
+
+
+def test_a_side_file_names_one_first_execution_frame_an_episode(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data")
+    (tmp_path / "starts.json").write_text('{"0": 4, "1": 1, "00": 2}')
+    table(tmp_path / "starts.parquet", {"episode_index": [0, 1, 0], "exec_start_idx": [4, 1, 2]})
+    for name in ("starts.json", "starts.parquet"):
+        with pytest.raises(UserError, match="episode 0 two first execution frames, 4 and 2"):
+            EpisodeSource(tmp_path / "data", tmp_path / name, robot=custom_robot())
+
+
 def test_other_statistics_than_the_rows_have_are_a_warning(tmp_path: Path, caplog) -> None:
     write_dataset(tmp_path)
     stats = {"action": {"min": [-9.0] * 3, "max": [9.0] * 3}}
     (tmp_path / "meta" / "stats.json").write_text(json.dumps(stats))
     opened(tmp_path)
     assert "number 1 of action lies within -9 and 9, in the rows within" in caplog.text
+
+
+# Columns and sources
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (
+            lambda robot: robot["cameras"].update(side={"key": CAMERA}),
+            r"top would be read as the camera 'top' and as the camera 'side' of the robot",
+        ),
+        (
+            lambda robot: robot["state"].update(key="action"),
+            r"action would be read as the state and as the action",
+        ),
+        (
+            lambda robot: robot["action"].update(key=["action", "action"], width=6),
+            r"action would be read as the action and as the action",
+        ),
+    ],
+)
+def test_a_column_is_read_once(tmp_path: Path, edit, words: str) -> None:
+    section = custom_robot().to_dict()
+    section["action"].update(names=None, units=None)
+    edit(section)
+    with pytest.raises(UserError, match=words):
+        EpisodeSource(write_dataset(tmp_path), robot=Embodiment.from_dict(section))
+
+
+def test_numbers_in_a_column_of_flags_are_not_taken_for_one(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    change_info(tmp_path, lambda info: info["features"]["action"].update(dtype="bool"))
+    with pytest.raises(UserError, match=r"action is bool in meta/info.json, .* holds .*float"):
+        opened(tmp_path)
+
+
+def test_two_sources_of_one_content_are_a_warning(tmp_path: Path, caplog) -> None:
+    write_dataset(tmp_path / "one")
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    write_dataset(tmp_path / "three", tasks=TASKS[::-1])
+    open_sources([str(tmp_path / "one"), str(tmp_path / "three")], custom_robot())
+    assert not caplog.text
+    open_sources([str(tmp_path / name) for name in ("one", "two")], custom_robot())
+    assert "The sources one and two hold the same episodes" in caplog.text
 
 
 # Videos
@@ -481,7 +578,7 @@ def test_the_same_names_in_another_order_are_refused_and_other_names_named(
 ) -> None:
     names = ["shoulder", "elbow", "gripper"]
     roots = [
-        write_dataset(tmp_path / str(i), names=other)
+        write_dataset(tmp_path / str(i), names=other, tasks=(f"take {i}", "put it back"))
         for i, other in enumerate(
             (names, ["elbow", "shoulder", "gripper"], {"motors": names}, ["hip", "knee", "toe"])
         )

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from helpers import artefacts
-from mme_vla.data.cache import VisionCache, sum_file, token_file
+from mme_vla.data.cache import VisionCache, score_file, sum_file, token_file
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.errors import UserError
@@ -178,6 +178,28 @@ def test_a_flipped_bit_in_cached_tokens_is_detected_when_the_episode_is_first_re
     vision.history(0)
     with pytest.raises(UserError, match=r"episode_000001.npy is damaged.*rebuild=true"):
         vision.history(1)
+
+
+@pytest.mark.parametrize("what", ["empty", "another episode's", "scores alone"])
+def test_sums_that_do_not_list_the_tokens_are_refused(cache: Path, what: str) -> None:
+    lines = sum_file(cache, 1).read_text().splitlines(keepends=True)
+    text = {
+        "empty": "",
+        "another episode's": sum_file(cache, 0).read_text(),
+        "scores alone": "".join(line for line in lines if ".scores." in line),
+    }[what]
+    sum_file(cache, 1).write_text(text)
+    with pytest.raises(UserError, match=r"episode_000001.sha256 is damaged: it does not list ep"):
+        opened(cache).history(1)
+
+
+def test_scores_out_of_order_are_refused(cache: Path) -> None:
+    path = score_file(cache, 1)
+    stored = dict(np.load(path))
+    np.savez(path, frames=stored["frames"][::-1], values=stored["values"])
+    sum_file(cache, 1).unlink()
+    with pytest.raises(UserError, match="of ascending int64"):
+        opened(cache).history(1)
 
 
 def test_a_cache_without_sums_still_opens(cache: Path) -> None:

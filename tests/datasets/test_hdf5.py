@@ -1,12 +1,17 @@
 """Reading official HDF5 files."""
 
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 from helpers.h5_files import write_file
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.errors import UserError
 
@@ -75,6 +80,84 @@ def test_a_damaged_episode_is_named(tmp_path: Path, damage, message: str) -> Non
         open_episode(EpisodeRef(path, 0, "Alpha")) as episode,
     ):
         list(episode)
+
+
+def replaced(name: str, value: Any) -> Callable[[h5py.Group], None]:
+    def replace(episode: h5py.Group) -> None:
+        del episode[name]
+        episode[name] = value
+
+    return replace
+
+
+def choice(letter: str, *point: int) -> Callable[[h5py.Group], None]:
+    text = json.dumps({"choice": letter, "point": point})
+    return replaced("timestep_4/action/choice_action", text)
+
+
+NAN, FAR = np.array([np.nan, *range(6)]), np.array([1e39, *range(7)])
+WAYPOINT = "timestep_8/action/waypoint_action"
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (replaced("setup/task_goal", np.array([0.0])), "setup/task_goal is damaged.*a text is exp"),
+        (replaced("setup/task_goal", ""), "setup/task_goal is empty"),
+        (replaced("setup/difficulty", 3), "setup/difficulty is damaged.*a text is expected"),
+        (replaced("timestep_5/action/joint_action", FAR), "timestep_5/.* within float32"),
+        (replaced(WAYPOINT, NAN), "timestep_8/action/waypoint_action .*or NaN alone"),
+        (replaced(WAYPOINT, np.full(7, np.inf)), "timestep_8/action/waypoint_action .*inf"),
+        (replaced(WAYPOINT, np.full(7, np.nan)), "timestep_8/.* NaN after a step that has a pose"),
+        (choice("H"), "timestep_4/action/choice_action: .* chooses 'h', but the episode offers a"),
+        (choice("A"), "timestep_4/action/choice_action: .* no point, which the option 'a' needs"),
+        (choice("A", -4, 9999), "timestep_4/action/choice_action: .* and pixels to 256"),
+        (
+            replaced("timestep_5/obs/wrist_rgb", np.zeros((4, 4, 3), np.uint8)),
+            r"'wrist' at step 5 is \[4, 4, 3\], the one read first \[16, 16, 3\]",
+        ),
+    ],
+)
+def test_values_that_cannot_be_are_named_before_they_are_converted(
+    tmp_path: Path, damage: Callable[[h5py.Group], None], message: str
+) -> None:
+    path = tmp_path / "record_dataset_Alpha.h5"
+    write_file(path, [12], videos=[4], poses=True, choices=True)
+    with h5py.File(path, "r+") as file:
+        damage(file["episode_0"])
+    with pytest.raises(UserError, match=message):
+        convert(list_episodes([path]), tmp_path / "data", ConvertOptions(images="png"))
+
+
+def test_an_image_that_was_not_rendered_is_named_whatever_the_choice_of_frames_says(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "record_dataset_Alpha.h5"
+    write_file(path, [12])
+    with h5py.File(path, "r+") as file:
+        file["episode_0/setup/frames"] = "{}"
+        del file["episode_0/timestep_7/obs/front_rgb"]
+    with (
+        open_episode(EpisodeRef(path, 0, "Alpha")) as episode,
+        pytest.raises(UserError, match="front was not rendered at step 7"),
+    ):
+        episode.front(7)
+
+
+def test_episodes_that_one_dataset_cannot_hold_are_refused_before_any_is_converted(
+    tmp_path: Path,
+) -> None:
+    for name, size in (("Alpha", 16), ("Beta", 32)):
+        write_file(tmp_path / f"record_dataset_{name}.h5", [12], size=size)
+    refs = list_episodes(find_files([tmp_path]))
+    with pytest.raises(UserError, match=r"Beta.h5 episode_0 has images \[32, 32, 3\], .*Alpha.h5"):
+        convert(refs, tmp_path / "data")
+    (tmp_path / "copy").mkdir()
+    copy = tmp_path / "copy" / refs[0].file.name
+    shutil.copy(refs[0].file, copy)
+    with pytest.raises(UserError, match=r"are copies of one file: episode_0 would be .* twice"):
+        convert([refs[0], *list_episodes([copy])], tmp_path / "data")
+    assert not (tmp_path / "data").exists()
 
 
 def test_what_is_no_demonstration_file_is_refused(tmp_path: Path) -> None:

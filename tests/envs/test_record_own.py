@@ -3,6 +3,7 @@ cannot.
 """
 
 import csv
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from helpers import REPOSITORY
 from mme_vla.cli.record import record_environment
 from mme_vla.config.plugins import import_plugins
 from mme_vla.envs.base import environment
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.robomme.recording.own import episode_file, record_own
 from mme_vla.errors import UserError
 from mme_vla.utils import read_json
 
@@ -86,3 +89,23 @@ def test_a_recording_has_the_robots_names_of_an_action(
     features = read_json(root / "meta" / "info.json", "a dataset")["features"]
     assert features["action"]["names"] == names
     assert features["observation.state"]["names"][0] == "state 0"
+
+
+def test_an_episode_without_options_does_not_get_those_of_another(tmp_path: Path) -> None:
+    option = {"label": "a", "action": "press", "need_parameter": False}
+    specs = [EpisodeSpec("Blink", "train", n, n, "easy") for n in range(2)]
+    columns = {
+        "observation.images.top": np.zeros((3, 16, 16, 3), np.uint8),
+        "observation.state": np.zeros((3, 2), np.float32),
+        "action": np.zeros((3, 2), np.float32),
+        "is_demo": np.zeros((3, 1), bool),
+        "task": np.array("press"),
+    }
+    (tmp_path / "work").mkdir()
+    for spec, options in zip(specs, ([], [option]), strict=True):
+        path = tmp_path / "work" / episode_file(spec)
+        np.savez(path, **columns, options=np.array(json.dumps(options)))
+    record_own(environment("mme_vla"), specs, tmp_path / "data", tmp_path / "work")
+    records = read_json(tmp_path / "data" / "meta" / "robomme_episodes.json", "records")["episodes"]
+    assert [record["options"] for record in records] == [[], [option]]
+    assert [record["episode_index"] for record in records] == [0, 1]

@@ -88,6 +88,9 @@ def test_wrong_values_are_named() -> None:
         ({**good, "episode": "3"}, r"record\.episode='3' must be a whole number"),
         ({**good, "sucess": True}, r"Unknown key record\.sucess"),
         ({"model": "pi05"}, "lacks the key 'checkpoint'"),
+        ({**good, "episode": -1}, r"record\.episode=-1 must be a whole number from 0"),
+        ({**good, "steps": -3}, r"record\.steps=-3 must be a whole number from 0"),
+        ({**good, "seconds": {"total": -1.0}}, r"record\.seconds\.total=-1.0 must be"),
     ):
         with pytest.raises(UserError, match=message):
             EpisodeRecord.from_dict(values)
@@ -176,6 +179,13 @@ def test_one_episode_in_two_environments_is_refused() -> None:
 def test_a_run_of_two_step_limits_is_refused() -> None:
     with pytest.raises(UserError, match="mixes max_steps 300 and 1300"):
         by_run([record(), record(episode=1, max_steps=300)])
+
+
+def test_a_task_of_one_name_in_two_environments_is_refused() -> None:
+    of_one = [record(task="reach", env=env, episode=e) for e, env in enumerate(("mine", None))]
+    assert len(by_run(of_one)) == 1  # not every record names its environment
+    with pytest.raises(UserError, match="mixes env mine and yours"):
+        by_run([*of_one, record(task="reach", env="yours", episode=2)])
 
 
 def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:

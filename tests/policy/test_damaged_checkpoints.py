@@ -119,6 +119,46 @@ def test_a_flipped_bit_in_one_shard_is_detected(tmp_path: Path) -> None:
     assert f"{shard.name} is damaged" in refusal(MMEPolicy.from_pretrained, tmp_path)
 
 
+@pytest.mark.parametrize(("key", "value"), [("prompt_length", 48), ("prompt", "past_actions")])
+def test_settings_in_two_files_must_agree(key: str, value: Any, checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+    settings = json.loads((checkpoint / "processor.json").read_text())
+    assert json.loads((checkpoint / "config.json").read_text())["processor"][key] == settings[key]
+    (checkpoint / "processor.json").write_text(json.dumps({**settings, key: value}))
+    message = refusal(MMEPolicy.from_pretrained, checkpoint)
+    assert f"the processor's {key} is {value!r}, that of the configuration" in message
+
+
+def test_weights_that_float32_cannot_hold_are_refused(checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+    tensors = load_file(checkpoint / "model.safetensors")
+    name = "backbone.action_in.bias"
+    tensors[name] = torch.full_like(tensors[name], 1e300, dtype=torch.float64)
+    save_file(tensors, checkpoint / "model.safetensors")
+    for read in (MMEPolicy.from_pretrained, lambda folder: start_from(tiny(), folder)):
+        assert f"infinities in 1 tensor: {name}" in refusal(read, checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        ({"std": [-1.0] * 8}, "state: std is negative"),
+        ({"min": [-1.0] * 8, "max": [1.0] * 8, "q01": [-3.0] * 8}, "state: q01 lies below min"),
+        ({"min": [-1.0] * 8, "max": [1.0] * 8, "q99": [3.0] * 8}, "state: max lies below q99"),
+        ({"min": [-1.0] * 8, "max": [1.0] * 8, "mean": [3.0] * 8}, "state: max lies below mean"),
+        ({"q99": [1e300] * 8}, "state.q99 must be a list of finite numbers within float32"),
+    ],
+)
+def test_statistics_that_contradict_themselves_are_refused(
+    edit: dict[str, Any], words: str, checkpoint: Path
+) -> None:
+    (checkpoint / SUMS).unlink()
+    stats = json.loads((checkpoint / "norm_stats.json").read_text())
+    stats["norm_stats"]["state"].update(edit)
+    (checkpoint / "norm_stats.json").write_text(json.dumps(stats))
+    assert words in refusal(MMEPolicy.from_pretrained, checkpoint)
+
+
 def test_an_unknown_key_of_the_training_state_is_refused(checkpoint: Path) -> None:
     (checkpoint / SUMS).unlink()
     state = json.loads((checkpoint / "training_state.json").read_text())
@@ -236,3 +276,23 @@ def test_a_backbone_of_null_is_a_missing_section(checkpoint: Path) -> None:
     (checkpoint / SUMS).unlink()
     message = refusal(MMEPolicy.from_pretrained, checkpoint)
     assert "lacks the section 'backbone'" in message
+
+
+def test_a_training_state_of_another_step_than_its_folder_is_refused(checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+    state = json.loads((checkpoint / "training_state.json").read_text())
+    (checkpoint / "training_state.json").write_text(json.dumps({**state, "step": 500}))
+    assert "has step 500, but its folder is called step_000001" in refusal(read_state, checkpoint)
+
+
+@pytest.mark.parametrize("edit", ["missing", "wide"])
+def test_an_optimizer_state_of_another_form_is_refused(edit: str, checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+    moments = load_file(checkpoint / "optimizer.safetensors")
+    name = "backbone.action_in.bias"
+    if edit == "missing":
+        del moments[f"{name}/exp_avg"]
+    else:
+        moments[f"{name}/step"] = torch.ones(3)
+    save_file(moments, checkpoint / "optimizer.safetensors")
+    assert f"{name}/" in refusal(resume, checkpoint)

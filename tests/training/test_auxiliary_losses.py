@@ -14,8 +14,17 @@ import pytest
 import torch
 
 from helpers import REPOSITORY
+from helpers.lerobot_tables import custom_robot, write_dataset
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.data.columns import BOUNDARY, FACT, FACT_VISIBLE, SUBTASK, label_column
+from mme_vla.data.columns import (
+    BOUNDARY,
+    FACT,
+    FACT_VISIBLE,
+    SUBTASK,
+    label_column,
+    text_column,
+    weight_column,
+)
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import FACTS, SAMPLE
@@ -175,7 +184,9 @@ def sample_with(folder: Path, *facts: tuple[int, Fact]) -> Path:
     root = folder / "sample"
     shutil.copytree(SAMPLE, root)
     (root / "SHA256SUMS").unlink(missing_ok=True)
-    write_facts(root / FACTS, [(episode, "a task", [fact]) for episode, fact in facts])
+    source = EpisodeSource(root)
+    tables = [(episode, source.task(episode), [fact]) for episode, fact in facts]
+    write_facts(root / FACTS, tables)
     return root
 
 
@@ -214,15 +225,24 @@ def test_keyframes_learn_from_facts(tmp_path: Path) -> None:
     assert policy.train()(batch, noise)[1]["losses/write"] > 0
 
 
+HEADER, OF_0 = "episode,task,fact,from,to\n", "VideoUnmask,red"
+
+
 @pytest.mark.parametrize(
     ("table", "problem"),
     [
         (None, r"sample has no meta/facts.csv. `mme-vla record` writes it"),
         ("episode,from\n0,1\n", "is no table of facts"),
-        ("episode,from,to\n0,first,2\n", "is no table of facts"),
-        ("episode,from,to\n0,1,2\n99,1,2\n", "line 3 of .* frames 1 to 2 of episode 99, which"),
-        ("episode,from,to\n0,1,9999\n", "line 2 of .* frames 1 to 9999 of episode 0, which"),
-        ("episode,from,to\n0,2,1\n", "line 2 of .* frames 2 to 1 of episode 0, which"),
+        (f"{HEADER}0,{OF_0},first,2\n", "is no table of facts"),
+        (f"{HEADER}0,{OF_0},,2\n", "is no table of facts"),
+        (
+            f"{HEADER}0,{OF_0},1,2\n99,{OF_0},1,2\n",
+            "line 3 of .* frames 1 to 2 of episode 99, which",
+        ),
+        (f"{HEADER}0,{OF_0},1,9999\n", "line 2 of .* frames 1 to 9999 of episode 0, which"),
+        (f"{HEADER}0,{OF_0},2,1\n", "line 2 of .* frames 2 to 1 of episode 0, which"),
+        (f"{HEADER}1,{OF_0},1,2\n", "line 2 of .* is of the task 'VideoUnmask'; episode 1 .*Lock"),
+        (f"{HEADER}0,{OF_0},1,4\n0,{OF_0},4,9\n", "line 3 of .* the fact 'red' at frames 4 to 9"),
     ],
 )
 def test_facts_that_contradict_the_dataset_are_reported(
@@ -252,6 +272,12 @@ CASES: list[tuple[str, Callable[[np.ndarray], pa.Array], str]] = [
         lambda v: pa.array([[x] * (3 if i == 400 else 2) for i, x in enumerate(v)]),
         "does not hold 2 numbers",
     ),
+    ("empty", lambda v: pa.array([[]] * len(v), pa.list_(pa.float32())), "does not hold 1 num"),
+    (
+        "too large",
+        lambda v: pa.array(np.where(np.arange(len(v)) == 400, 2**24 + 1, 7)),
+        r"holds a whole number that float32 cannot \(beyond 2\*\*24\)",
+    ),
 ]
 
 
@@ -267,11 +293,55 @@ def test_a_bad_label_names_column_and_episode(
         table.append_column("reward", change(np.arange(len(table), dtype=np.float64))), root / TABLE
     )
     source = EpisodeSource(root)
-    episode, frame = source.locate(400)
+    episode, frame = source.locate(0 if name == "empty" else 400)
     with pytest.raises(
-        UserError, match=rf"'reward' of sample {problem} at frame {frame} of episode {episode} "
+        UserError, match=rf"'reward' of sample {problem}.* at frame {frame} of episode {episode} "
     ):
         label_column(source, "reward", "data.weights")
+
+
+def labelled_dataset(root: Path, values: list[Any], more: list[Any]) -> EpisodeSource:
+    """A small dataset of two files, whose column `extra` has these values."""
+    write_dataset(root)
+    rows = pq.ParquetFile(root / TABLE).read()
+    for number, column in enumerate((values, more)):
+        part = rows.slice(5 * number, len(column)).append_column("extra", pa.array(column))
+        pq.write_table(part, root / TABLE.replace("file-000", f"file-00{number}"))
+    return EpisodeSource(root, robot=custom_robot())
+
+
+def test_a_label_has_one_type_in_all_files(tmp_path: Path) -> None:
+    source = labelled_dataset(tmp_path, [1] * 5, [0.5] * 4)
+    with pytest.raises(UserError, match=r"'extra' of .* holds double and int64 in different files"):
+        label_column(source, "extra", "data.weights")
+
+
+def test_weights_that_leave_nothing_to_learn_are_refused(tmp_path: Path) -> None:
+    source = labelled_dataset(tmp_path, [0.0] * 5, [1e-60] * 4)
+    with pytest.raises(UserError, match=r"'extra' of .* is 0 at every frame"):
+        weight_column(source, "extra")
+
+
+@pytest.mark.parametrize("text", ["", "  \n", None])
+def test_a_text_that_says_nothing_is_refused(tmp_path: Path, text: str | None) -> None:
+    source = labelled_dataset(tmp_path, ["push"] * 5, ["pull", "pull", text, "pull"])
+    with pytest.raises(UserError, match=r"has no text at frame 2 of episode 1 "):
+        text_column(source, "extra", "subgoal_text")
+    source = labelled_dataset(tmp_path, [1] * 5, [2] * 4)
+    with pytest.raises(UserError, match=r"holds int64, no texts"):
+        text_column(source, "extra", "subgoal_text")
+
+
+def test_training_with_subgoals_reads_their_columns_when_it_begins(tmp_path: Path) -> None:
+    root = sample_with(tmp_path)
+    table = pq.read_table(root / TABLE)
+    texts = table["simple_subgoal_online"].to_pylist()
+    texts[400] = ""
+    table = table.drop_columns(["simple_subgoal_online"])
+    table = table.append_column("simple_subgoal_online", pa.array(texts))
+    pq.write_table(table, root / TABLE)
+    with pytest.raises(UserError, match=r"'simple_subgoal_online' of sample has no text at frame"):
+        prepared(small_policy("simplesg"), tmp_path, sources=[str(root)])
 
 
 def test_an_absent_column_is_reported() -> None:

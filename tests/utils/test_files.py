@@ -47,8 +47,9 @@ DEEP = "[" * 200_000
         (b'{"a": Infinity}', "Infinity is not a number"),
         (b'{"a": 1e999}', "out of range"),
         (b'{"a": "\xff"}', "not UTF-8"),
+        (b'{"a": {"b": 1, "c": 2, "b": 1}}', "the key 'b' is there twice"),
     ],
-    ids=["cut", "empty", "deep", "list", "digits", "infinity", "overflow", "latin"],
+    ids=["cut", "empty", "deep", "list", "digits", "infinity", "overflow", "latin", "twice"],
 )
 def test_damaged_json_is_one_short_sentence_that_names_the_file(
     tmp_path: Path, content: bytes, words: str

@@ -108,6 +108,8 @@ def test_what_lerobot_has_no_step_for_is_reported(
 ) -> None:
     policy = exportable()
     policy.config["processor"] |= changes
+    if "prompt" in changes:
+        policy.require_processor().prompt_name = changes["prompt"]  # type: ignore[attr-defined]
     policy.save_pretrained(tmp_path / "ours")
     with pytest.warns(UserWarning, match=message):
         convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")

@@ -13,23 +13,29 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
+from omegaconf import OmegaConf
 
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import NonNegative, NonNegativeInt, read_section
 from mme_vla.envs.metadata import episodes
-from mme_vla.errors import UserError, listed, require
+from mme_vla.errors import brief, listed, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, read_records
 from mme_vla.evaluation.store import RECORDS, RUN_FILE, find_records, read_run
 from mme_vla.policy.saving import composition_digest
 from mme_vla.policy.training_identity import TrainingIdentity
-from mme_vla.utils import read_json, read_text
+from mme_vla.utils import decoding, read_json, read_text
 
 CONFIG, TRAINED = "config.yaml", "trained.json"
 FILES = (CONFIG, RUN_FILE, TRAINED)
 SCENES = "scenes.json"
 CHOICES = "multi_choice"
 """The action space of the benchmark's own table; rows of another one have a table of their own."""
-_SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "seed": "model_seed"}
+_SETTINGS = {
+    "model": "model",
+    "split": "split",
+    "max_steps": "max_steps",
+    "checkpoint": "checkpoint",
+    "seed": "model_seed",
+}
 """Setting of `run.json` → field of its records."""
 
 
@@ -56,12 +62,12 @@ class Trained:
     recipe: str | None = None
     data: str | None = None
     weights: str | None = None
-    demonstrations: Mapping[str, int] | None = None
-    budget: int | None = None
-    parameters: int | None = None
-    update_s: float | None = None
-    update_flops: float | None = None
-    cpu_minutes: float | None = None
+    demonstrations: Mapping[str, NonNegativeInt] | None = None
+    budget: NonNegativeInt | None = None
+    parameters: NonNegativeInt | None = None
+    update_s: NonNegative | None = None
+    update_flops: NonNegative | None = None
+    cpu_minutes: NonNegative | None = None
 
     @property
     def identity(self) -> TrainingIdentity | None:
@@ -149,7 +155,7 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
         for earlier in row:
             both = f"{earlier.folder} and {training.folder}"
             first, second = earlier.facts, training.facts
-            for fact in ("kind", "recipe", "demonstrations", "budget"):
+            for fact in ("kind", "recipe", "demonstrations", "budget", "parameters"):
                 values = getattr(first, fact), getattr(second, fact)
                 require(
                     values[0] == values[1],
@@ -213,16 +219,19 @@ def read_training(folder: Path) -> Training:
         )
     facts = read_section(Trained, read_json(folder / TRAINED), f"{folder / TRAINED}", others=True)
     run = read_run(folder)
-    try:
-        config = yaml.safe_load(read_text(folder / CONFIG, "a composed configuration"))
-    except yaml.YAMLError as error:
-        raise UserError(f"{folder / CONFIG} is not YAML: {error}.") from None
+    text = read_text(folder / CONFIG, "a composed configuration")
+    with decoding(folder / CONFIG, "a composed configuration", "Copy it again."):
+        config: Any = OmegaConf.to_container(OmegaConf.create(text))
+    require(
+        isinstance(config, Mapping),
+        f"{folder / CONFIG} must hold sections of keys, not {brief(config)}.",
+    )
     every: list[EpisodeRecord] = []
     for file in find_records([folder]):
         every += read_records(file)
     records = _ended(every)
     require(records, f"{folder} lacks {RECORDS}, or it has no episode.")
-    _check_identity(folder, facts, run["settings"], config or {}, records)
+    _check_identity(folder, facts, run["settings"], config, records)
     counts = Counter(record.key for record in records)
     twice = [f"{key.task} {key.episode}" for key, count in counts.items() if count > 1]
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
@@ -260,13 +269,24 @@ def _check_identity(
     records: Sequence[EpisodeRecord],
 ) -> None:
     """Make sure that the four files are of one training."""
-    expected: dict[str, Any] = {"training": facts.identity}
+    memory = config.get("memory")
+    budgets = {"its name": facts.row.partition("@")[2] or None}
+    if isinstance(memory, Mapping):
+        budgets[CONFIG] = memory.get("budget")
+    for place, budget in budgets.items():
+        require(
+            budget is None or str(budget) == str(facts.budget),
+            f"{folder}: {facts.row} has {facts.budget} memory tokens in {TRAINED}, but"
+            f" {brief(budget)} by {place}. Correct the one that is wrong.",
+        )
+    expected: dict[str, Any] = {"training": facts.identity, "memory_budget": facts.budget}
+    expected["made_up"] = False
     for key, field in _SETTINGS.items():
-        if facts.trained or key in ("model", "split"):
+        if facts.trained or key in ("model", "split", "max_steps"):
             expected[field] = settings.get(key)
     if any(record.composition for record in records):
         expected["composition"] = composition_digest(config)
-    source = {"training": TRAINED, "composition": CONFIG}
+    source = {"training": TRAINED, "memory_budget": TRAINED, "composition": CONFIG}
     for record in records:
         for field, value in expected.items():
             require(
@@ -289,6 +309,10 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
     tried: dict[str, str] = {}
     if file.is_file():
         tried = read_json(file, "the scenes of a split").get("tried", {})
+        require(
+            isinstance(tried, Mapping),
+            f"{file}: tried must be a section of keys, not {brief(tried)}.",
+        )
     n_scenes = max(Counter(record.task for record in records).values())
     by_key = {record.key: record for record in records}
     numbered = []

@@ -68,7 +68,7 @@ def record_own(
                         np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             advance(1)
         tables: list[tuple[int, str, list[Fact]]] = []
-        records: list[dict[str, Any]] = []  # of episodes with options
+        records: list[dict[str, Any]] = []
         for path in filter(Path.is_file, episodes):
             with np.load(path) as loaded:
                 columns = dict(loaded)
@@ -77,8 +77,8 @@ def record_own(
             facts = parse_json(str(columns.pop("facts", "[]")), str(path), list)
             options = parse_json(str(columns.pop("options", "[]")), str(path), list)
             task = episodes[path].task
-            if options:
-                records.append({"task": task, "options": options})
+            # Of every episode, also of one without options: a reader counts them.
+            records.append({"episode_index": len(tables), "task": task, "options": options})
             tables.append((len(tables), task, [Fact.from_dict(fact) for fact in facts]))
             length = len(columns[STATE])
             for frame in range(length):
@@ -97,7 +97,7 @@ def record_own(
             )
         dataset.finalize()
     write_facts(draft / FACTS, tables)
-    if records:
+    if any(record["options"] for record in records):
         write_json(draft / SIDE_FILE, {"episodes": records}, indent=None)
     draft.rename(output)
     return frames, failures
