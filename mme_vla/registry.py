@@ -273,6 +273,12 @@ class Registry[T]:
         """The error about a section's options, with those that its constructor and its base
         classes' take.
         """
+        for key in fixed:
+            if f"'{key}'" in reason:
+                return UserError(
+                    f"{self.kind} {name!r}: its constructor must take {' and '.join(fixed)}, which"
+                    f" follow from the other parts ({reason})."
+                )
         entry: Any = self[name]
         makers = list(entry.__mro__ if isinstance(entry, type) else (entry,))
         for maker in list(makers):
