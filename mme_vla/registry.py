@@ -212,7 +212,10 @@ class Registry[T]:
 
     def __getitem__(self, name: str) -> T:
         if not isinstance(name, str) or name not in self:
-            raise UserError(f"Unknown {self.kind} {brief(name)}. {did_you_mean(brief(name), self)}")
+            hint = did_you_mean(brief(name), self)
+            if hint.startswith("Known"):
+                hint += " One of your own is registered by a module that `plugins` names."
+            raise UserError(f"Unknown {self.kind} {brief(name)}. {hint}")
         if name not in self._entries:
             importlib.import_module(str(self._module_of(name)))
         return self._entries[name]

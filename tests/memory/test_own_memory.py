@@ -159,6 +159,11 @@ def test_a_constructor_without_the_widths_is_named(monkeypatch):
         check_memory("mistaken")
 
 
+def test_an_unknown_memory_leads_to_plugins():
+    with pytest.raises(UserError, match=r"One of your own .* that `plugins` names\."):
+        check_memory("qqqq")
+
+
 def test_a_new_ranking_keeps_the_cache_and_new_scores_have_their_own(rules):
     released = TokenDrop(64, 32)
     assert rules.RecentChanges(64, 32).storage == released.storage
