@@ -137,7 +137,18 @@ class MMEModel(nn.Module):
             return self.memory(history)
 
     def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
-        """The observation's blocks with memory added. The batch's images are prepared."""
+        """The observation's blocks with memory added. The batch's images are prepared.
+
+        Raises:
+            ValueError: there are more memory tokens than the memory's budget.
+        """
+        if memory is not None and self.memory is not None:
+            n_tokens = memory.tokens.shape[1]
+            if n_tokens > self.memory.budget:
+                raise ValueError(
+                    f"{type(self.memory).__name__} returned {n_tokens} memory tokens; its budget is"
+                    f" {self.memory.budget}."
+                )
         injection = self.integration.inject(self.backbone.embed(batch), memory)
         if "positions" not in self.backbone.supports:
             for block in injection.blocks:

@@ -212,7 +212,10 @@ class Registry[T]:
 
     def __getitem__(self, name: str) -> T:
         if not isinstance(name, str) or name not in self:
-            raise UserError(f"Unknown {self.kind} {brief(name)}. {did_you_mean(brief(name), self)}")
+            hint = did_you_mean(brief(name), self)
+            if hint.startswith("Known"):
+                hint += " One of your own is registered by a module that `plugins` names."
+            raise UserError(f"Unknown {self.kind} {brief(name)}. {hint}")
         if name not in self._entries:
             importlib.import_module(str(self._module_of(name)))
         return self._entries[name]
@@ -273,6 +276,12 @@ class Registry[T]:
         """The error about a section's options, with those that its constructor and its base
         classes' take.
         """
+        for key in fixed:
+            if f"'{key}'" in reason:
+                return UserError(
+                    f"{self.kind} {name!r}: its constructor must take {' and '.join(fixed)}, which"
+                    f" follow from the other parts ({reason})."
+                )
         entry: Any = self[name]
         makers = list(entry.__mro__ if isinstance(entry, type) else (entry,))
         for maker in list(makers):

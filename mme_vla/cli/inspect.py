@@ -32,7 +32,7 @@ from mme_vla.embodiment.action_space import numbered
 from mme_vla.errors import UserError, counted, printable, require
 from mme_vla.evaluation.records import display_name
 from mme_vla.memory.base import Memory
-from mme_vla.memory.history import OnlineHistory
+from mme_vla.memory.history import OnlineHistory, TokenlessHistory
 from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
@@ -528,16 +528,16 @@ def draw_memory(
     history = OnlineHistory(memory.storage, memory.make_scorer(), start)
     stored = history.to_encode(len(frames))
     patches = memory.storage.grid**2
-    history.append(frames, torch.zeros(len(stored), patches, 1))  # selections do not read tokens
+    history.append(frames, torch.zeros(len(stored), patches, 1))
     motion = normalised_states(source.states(episode, 0, step + 1))
     history.motion = motion.__getitem__
     history.state_width = motion.shape[1]
-    selected = memory.select(history, step)
+    selected = memory.select(TokenlessHistory(history), step)
     remembered = np.unique(selected[:, 0])
     table = _table(f"{name} at step {step}", "", "")
     table.add_row(
         "remembers",
-        f"{len(selected)} of {counted(memory.budget, 'token')}, in {len(remembered)} of"
+        f"{len(selected)} of {counted(memory.capacity, 'token')}, in {len(remembered)} of"
         f" {counted(step + 1, 'frame')}",
     )
     table.add_row("frames", ", ".join(map(str, remembered)))
@@ -549,7 +549,7 @@ def draw_memory(
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
     title = (
-        f"{name} at step {step}: {len(selected)} of {memory.budget} tokens ·"
+        f"{name} at step {step}: {len(selected)} of {memory.capacity} tokens ·"
         f" {source.goal(episode, step)}"
     )
     memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)

@@ -110,7 +110,9 @@ class MemoryModule(nn.Module):
         Returns:
             int64 [n, 2] of (frame, patch) in time order, n ≤ `capacity`.
         """
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} has no select(self, history, step, rng=None): define it."
+        )
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         """Encode the selection [b, n, d_vision] into memory tokens [b, budget, d].

@@ -414,6 +414,21 @@ class DerivedHistory(History):
         return self._source.stored_frames
 
 
+class TokensReadError(UserError):
+    """A memory reads vision tokens to choose, and there are none."""
+
+
+class TokenlessHistory(DerivedHistory):
+    """A history without vision tokens, for memories that choose without them."""
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        raise TokensReadError(
+            "This memory reads vision tokens to choose its frames, and a memory alone has none. A"
+            " trained policy has them: `mme-vla analyse writing --checkpoint FOLDER` scores what it"
+            " keeps."
+        )
+
+
 class PromptConditionedHistory(DerivedHistory):
     """A history whose tokens are changed as they are gathered, by `with_prompt`
     (`MMEModel.prompt_condition`, of a batch of one).

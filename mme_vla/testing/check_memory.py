@@ -34,6 +34,10 @@ def check_memory(name: str, frames: int = 48, **options: Any) -> None:
     """
     memory: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
     memory.eval()
+    for attribute in ("budget", "capacity", "storage"):
+        assert hasattr(memory, attribute), (
+            f"{type(memory).__name__} has no {attribute}: set self.{attribute} in its constructor."
+        )
     check_scorer(memory)
     check_selection(memory, frames)
     print(
@@ -133,6 +137,10 @@ def check_selection(memory: Memory, frames: int) -> None:
     full = episode.cached()
     for step in (0, 1, 15, 16, 17, 39, frames - 1):
         selection = memory.select(full, step)
+        assert isinstance(selection, np.ndarray), (
+            "select must return a NumPy array of whole numbers [n, 2] of (frame, patch); at step"
+            f" {step} it gave {type(selection).__name__}."
+        )
         is_pairs = selection.ndim == 2 and selection.shape[1] == 2
         assert is_pairs and np.issubdtype(selection.dtype, np.integer), (
             f"select must return whole numbers [n, 2] of (frame, patch); at step {step} it gave"
@@ -145,7 +153,9 @@ def check_selection(memory: Memory, frames: int) -> None:
             f"at step {step} select chose frame {selection[:, 0].max()}, which is later."
         )
         assert selection.min() >= 0 and selection[:, 1].max() < patches, (
-            f"patches must lie in 0 to {patches - 1}."
+            f"patches must lie in 0 to {patches - 1}; at step {step} select chose"
+            f" {selection[:, 1].min()} to {selection[:, 1].max()}, of frames from"
+            f" {selection[:, 0].min()} on."
         )
         assert (np.diff(selection[:, 0]) >= 0).all(), (
             f"at step {step} the selection is not in time order."
@@ -156,7 +166,11 @@ def check_selection(memory: Memory, frames: int) -> None:
         stored = set(memory.storage.stored_frames(step + 1).tolist())
         # A memory that reads states may select frames that have no tokens.
         selected_frames = set() if memory.uses_proprio else set(selection[:, 0].tolist())
-        assert selected_frames <= stored, "select chose frames that the StorageSpec does not keep."
+        assert selected_frames <= stored, (
+            f"at step {step} select chose frames {sorted(selected_frames - stored)}, which the"
+            f" StorageSpec does not keep (keep_every={memory.storage.keep_every}). Those that it"
+            " keeps are history.stored_frames."
+        )
         check_length(memory, full, step)
         again = memory.select(full, step)
         assert np.array_equal(selection, again), (
@@ -212,16 +226,38 @@ def check_encoding(memory: Memory, frames: int) -> None:
     full = Episode(memory, frames).cached()
     selections = [memory.gather_selection(full, step) for step in (2, frames - 1)]
     history = stack_history(selections)  # the first with padding, if it is shorter
+    before = {name: getattr(history, name).clone() for name in ("features", "positions", "mask")}
     encoded = _encoded(memory, history)
+    assert isinstance(encoded, MemoryTokens), (
+        f"forward must return MemoryTokens(tokens, mask); got {type(encoded).__name__}."
+    )
+    for name, values in before.items():
+        assert torch.equal(getattr(history, name), values), (
+            f"forward changed history.{name} in place: change a copy."
+        )
     shape = (2, memory.budget, WIDTH)
     assert encoded.tokens.shape == shape, (
         f"forward must return tokens {shape}; got {tuple(encoded.tokens.shape)}."
     )
     assert encoded.mask.shape == shape[:2] and encoded.mask.dtype == torch.bool, (
-        "the mask must be bool [b, budget]."
+        f"the mask must be bool {shape[:2]}; got {encoded.mask.dtype} {tuple(encoded.mask.shape)}."
     )
+    assert not memory.timed or (encoded.ages is not None and encoded.ages.shape == shape[:2]), (
+        f"timed is True, so forward must return MemoryTokens with ages {shape[:2]}: give them, or"
+        " set timed = False."
+    )
+    for name, loss in encoded.losses.items():
+        assert loss.shape == shape[:1], (
+            f"losses must have one number a sample, {shape[:1]}; {name} has {tuple(loss.shape)}."
+        )
     assert encoded.mask.any(1).all(), "a row has no valid memory token."
     assert torch.isfinite(_valid(encoded)).all(), "a valid memory token is not finite."
+
+    error = float((_valid(_encoded(memory, history)) - _valid(encoded)).abs().max())
+    assert error <= TOLERANCE, (
+        f"the same selection gave other tokens the second time (by {error:.2g}). A state belongs"
+        " to `start_stream` and `encode`, not to `self`."
+    )
 
     padded = replace(
         history, features=history.features.clone(), positions=history.positions.clone()

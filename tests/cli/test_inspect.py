@@ -64,6 +64,25 @@ def test_a_memory_is_rendered_as_it_selects(
     assert f"of {memory.budget} tokens" in console.export_text()
 
 
+def test_a_memory_that_chooses_by_tokens_is_not_rendered(
+    sample: EpisodeSource, console: Console, tmp_path: Path
+) -> None:
+    config = resolved(compose("inspect", ["memory=retrieval"]))
+    memory = build_memory(Inspection.from_config(config))
+    with pytest.raises(UserError, match="reads vision tokens to choose its frames"):
+        draw_memory(sample, 0, 170, memory, "retrieval", tmp_path, console)
+
+
+def test_the_tokens_that_are_read_are_counted_against_the_most_that_can_be(
+    sample: EpisodeSource, console: Console, tmp_path: Path
+) -> None:
+    config = resolved(compose("inspect", ["memory=ttt", "memory.budget=64"]))
+    memory = build_memory(Inspection.from_config(config))
+    draw_memory(sample, 0, 170, memory, "ttt", tmp_path, console)
+    assert f"of {memory.capacity:,} tokens" in console.export_text()
+    assert memory.capacity > memory.budget
+
+
 def test_a_checkpoint_shows_its_parts(tmp_path: Path, console: Console) -> None:
     policy = build_policy("framesamp_modul", memory={"budget": 64})
     policy.save_pretrained(tmp_path)

@@ -9,16 +9,18 @@ import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from helpers import REPOSITORY
-from mme_vla import UserError, build_policy
+from mme_vla import Memory, MemoryTokens, UserError, build_policy, register
 from mme_vla.config.composition import compose
 from mme_vla.envs.rendering import render_backend
 from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.registry import MEMORIES
@@ -92,6 +94,74 @@ def test_a_selection_with_a_patch_twice_fails_the_check(rules, monkeypatch):
     monkeypatch.setattr(rules.RecentChanges, "select", first_twice)
     with pytest.raises(AssertionError, match="select chose a patch twice"):
         check_memory("recent_changes", budget=64, grid=4, stride=4)
+
+
+@pytest.mark.parametrize(
+    ("method", "replacement", "message"),
+    [
+        ("select", lambda memory, history, step, rng=None: [(step, 0)], "step 0 it gave list"),
+        ("forward", lambda memory, history: history.features, "MemoryTokens.*; got Tensor"),
+        (
+            "forward",
+            lambda memory, history: MemoryTokens(history.features.mul_(2), history.mask),
+            r"forward changed history\.features in place",
+        ),
+        (
+            "forward",
+            lambda memory, history: MemoryTokens(torch.ones(2, 16, 48), history.mask.float()),
+            r"bool \(2, 16\); got torch.float32 \(2, 16\)",
+        ),
+        (
+            "forward",
+            lambda memory, history: MemoryTokens(torch.ones(2, 16, 48), history.mask),
+            r"timed is True, so .* ages \(2, 16\)",
+        ),
+        (
+            "forward",
+            lambda memory, history: replace(
+                FrameSamp.forward(memory, history), losses={"write": torch.tensor(1.0)}
+            ),
+            r"one number a sample, \(2,\); write has \(\)",
+        ),
+        (
+            "forward",
+            lambda memory, history: replace(
+                FrameSamp.forward(memory, history), tokens=torch.randn(2, 16, 48)
+            ),
+            "other tokens the second time",
+        ),
+        ("__init__", lambda memory, d_vision, width, **_: Memory.__init__(memory), "no budget"),
+    ],
+)
+def test_a_mistake_is_named_by_the_check(monkeypatch, method, replacement, message):
+    monkeypatch.setattr(MEMORIES, "_entries", dict(MEMORIES._entries))
+    register("memory", "mistaken")(type("Mistaken", (FrameSamp,), {method: replacement}))
+    with pytest.raises(AssertionError, match=message):
+        check_memory("mistaken", budget=16)
+
+
+def test_more_memory_tokens_than_the_budget_are_refused(policy):
+    encode = policy.memory.forward
+
+    def twice(history):
+        tokens = encode(history)
+        return MemoryTokens(tokens.tokens.repeat(1, 2, 1), tokens.mask.repeat(1, 2))
+
+    policy.memory.forward = twice
+    with pytest.raises(ValueError, match="returned 512 memory tokens; its budget is 256"):
+        policy(random_batch(policy))
+
+
+def test_a_constructor_without_the_widths_is_named(monkeypatch):
+    monkeypatch.setattr(MEMORIES, "_entries", dict(MEMORIES._entries))
+    register("memory", "mistaken")(lambda budget=16: FrameSamp(32, 48, budget))
+    with pytest.raises(UserError, match="its constructor must take d_vision and width"):
+        check_memory("mistaken")
+
+
+def test_an_unknown_memory_leads_to_plugins():
+    with pytest.raises(UserError, match=r"One of your own .* that `plugins` names\."):
+        check_memory("qqqq")
 
 
 def test_a_new_ranking_keeps_the_cache_and_new_scores_have_their_own(rules):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mme_vla.extras.methods.writable_memory import WritableMemory
 from mme_vla.memory.base import stack_history
-from mme_vla.memory.history import FrameScores, History
+from mme_vla.memory.history import DerivedHistory, FrameScores, History
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
@@ -115,6 +115,10 @@ class OnlyFrames(History):
     def __len__(self) -> int:
         return self._length
 
+    @property
+    def stored_frames(self) -> np.ndarray:
+        return self._stored
+
     def _motion(self, frames: np.ndarray) -> Tensor:
         """Of the stored frame that each frame is, or that comes before it."""
         stored = np.maximum(np.searchsorted(self._stored, frames, side="right") - 1, 0)
@@ -139,44 +143,42 @@ class OnlyFrames(History):
         return self._full_history.gather(np.stack([its, indices[:, 1]], axis=1))
 
 
-class Exchanged(History):
-    """A history whose frames hold what other frames held, of this episode or another."""
+class Exchanged(DerivedHistory):
+    """A history whose frames hold what other frames held, of this episode or another.
+
+    A memory chooses frames by the episode's own `scores`, `stored` and `proprio`.
+    """
 
     def __init__(self, full: History, places: Mapping[int, Place]) -> None:
-        super().__init__(full.spec, full.exec_start)
-        self._full_history, self._places = full, places
+        super().__init__(full)
+        self.clock_starts = (0,)  # entries have times of their own
+        self._places = places
         if full.motion is not None:
             self.motion = self._motion
-            self.state_width = full.state_width
-
-    def __len__(self) -> int:
-        return len(self._full_history)
-
-    @property
-    def scores(self) -> FrameScores:
-        return self._full_history.scores
 
     def proprio(self, frames: np.ndarray) -> Tensor:
-        """The episode's own, by which a memory chooses frames, as by `scores`."""
-        return self._full_history.proprio(frames)
+        return self._source.proprio(frames)
+
+    def stored(self, indices: np.ndarray) -> Tensor:
+        return self._source.stored(indices)
 
     def _motion(self, frames: np.ndarray) -> Tensor:
         rows = []
         for frame in frames.tolist():
-            history, its = self._places.get(frame, (self._full_history, frame))
+            history, its = self._places.get(frame, (self._source, frame))
             rows.append(history.motion_rows(np.array([its], np.int64)))
-        return torch.cat(rows) if rows else self._full_history.motion_rows(frames)
+        return torch.cat(rows) if rows else self._source.motion_rows(frames)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         # History → the rows of `indices` that it holds
         rows_of: dict[History, list[int]] = {}
         its_indices = indices.astype(np.int64)
         for row, frame in enumerate(indices[:, 0].tolist()):
-            history, its = self._places.get(frame, (self._full_history, frame))
+            history, its = self._places.get(frame, (self._source, frame))
             its_indices[row, 0] = its
             rows_of.setdefault(history, []).append(row)
         if not rows_of:
-            return self._full_history.gather(indices)
+            return self._source.gather(indices)
         order: list[int] = []
         tokens = []
         for history, rows in rows_of.items():

@@ -18,7 +18,13 @@ from mme_vla.envs.facts import Fact
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.evidence import EvidenceEpisode
 from mme_vla.memory.base import MemoryModule, stack_history
-from mme_vla.memory.history import CachedHistory, FrameScores, History
+from mme_vla.memory.history import (
+    CachedHistory,
+    FrameScores,
+    History,
+    TokenlessHistory,
+    TokensReadError,
+)
 from mme_vla.processing.normalise import normalize
 
 if TYPE_CHECKING:
@@ -32,10 +38,6 @@ FRAMES = 32
 """Frames that the reference selections keep: as many as FrameSamp."""
 Selection = Callable[[int], np.ndarray]
 """The frames kept at a step, ascending."""
-
-
-class TokensReadError(UserError):
-    """A memory reads vision tokens to choose, and there are none."""
 
 
 # Definitions --------------------------------------------------------------------------------------
@@ -270,16 +272,6 @@ REFERENCES = {
 """Selections without a memory, by name."""
 
 
-class TokenlessHistory(CachedHistory):
-    """An episode without vision tokens, for memories that choose without them."""
-
-    def gather(self, indices: np.ndarray) -> torch.Tensor:
-        raise TokensReadError(
-            "This memory reads vision tokens to choose its frames: name a checkpoint that has it"
-            " with --checkpoint."
-        )
-
-
 def selected_frames(memory: MemoryModule, history: History, step: int) -> np.ndarray:
     """The frames that a memory keeps at a step, ascending: those of its selection.
 
@@ -305,10 +297,10 @@ def reads_tokens(memory: MemoryModule) -> bool:
     frames.
     """
     stored = memory.storage.stored_frames(LONGEST)
-    history = TokenlessHistory(memory.storage, np.zeros(0), stored, LONGEST)
+    history = CachedHistory(memory.storage, np.zeros(0), stored, LONGEST)
     history.motion, history.state_width = torch.zeros(LONGEST, 8).__getitem__, 8
     try:
-        selected_frames(memory, history, LONGEST - 1)
+        selected_frames(memory, TokenlessHistory(history), LONGEST - 1)
     except TokensReadError:
         return True
     return False
@@ -350,15 +342,17 @@ def memory_selection(
 
     # Their tokens, for memories that read them.
     stored = memory.storage.stored_frames(episode.length)
-    kind: type[CachedHistory] = TokenlessHistory
     tokens = np.zeros(0)
     if policy is not None:
         images = np.stack([episode.images[frame] for frame in stored.tolist()])
-        kind = CachedHistory
         tokens = policy.encode_frames(images).float().cpu().numpy()
-    history = kind(memory.storage, tokens, stored, episode.length, scores, episode.exec_start)
+    history: History = CachedHistory(
+        memory.storage, tokens, stored, episode.length, scores, episode.exec_start
+    )
     history.motion = states.__getitem__
     history.state_width = states.shape[1]
+    if policy is None:
+        history = TokenlessHistory(history)
     return lambda step: selected_frames(memory, history, step)
 
 

@@ -195,6 +195,23 @@ def test_mistakes_end_with_a_sentence(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["selection", "attention"])
+def test_a_memory_of_ones_own_is_found_by_config_dir(
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    example = REPOSITORY / "examples" / "last_frames"
+    monkeypatch.syspath_prepend(example)
+    words = {
+        "selection": ["--memory", "last_frames", "--every", "60", "--output", f"{tmp_path}/s.mp4"],
+        "attention": ["--model", "last_frames_context", "--episodes", "0", "--most", "1"],
+    }
+    main([command, "--config-dir", str(example / "configs"), *words[command]])
+    assert {"selection": "wrote", "attention": "observation"}[command] in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "logged"),
     [

@@ -16,7 +16,8 @@ from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.lines import MomentLine
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
-from mme_vla.memory.history import OnlineHistory
+from mme_vla.memory.base import all_patches
+from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.processing.normalise import NormStats
 from mme_vla.testing.small import unit_stats
 from mme_vla.training.open_loop import open_loop
@@ -121,6 +122,28 @@ def test_a_memory_that_reads_the_robots_motion_can_be_probed(model: str) -> None
         changed = chunks(policy, word)[1]
         same = [np.array_equal(a, b) for a, b in zip(baseline, changed, strict=True)]
         assert not all(same), word  # a fresh memory changes little
+
+
+@pytest.mark.parametrize("word", ["shuffle", "recent:24"])
+def test_a_memory_that_chooses_by_stored_tokens_keeps_its_choice(word: str) -> None:
+    policy = quick_policy("framesamp_modul", 8).eval()
+    memory = policy.require_memory()
+    rows: list[np.ndarray] = []
+
+    def brightest(history: History, step: int, rng: Any = None) -> np.ndarray:
+        """The newest frame and that with the largest token, among the stored ones."""
+        kept = history.stored_frames
+        kept = kept[kept <= step]
+        tokens = history.stored(all_patches(kept, memory.storage.grid))
+        largest = tokens.unflatten(0, (len(kept), -1)).amax((1, 2)).argmax()
+        rows.append(all_patches(np.unique([kept[int(largest)], kept[-1]]), memory.storage.grid))
+        return rows[-1]
+
+    memory.select = brightest  # type: ignore[method-assign]
+    chunks(policy, word)
+    # Of a decision: what is remembered, and the same with other contents.
+    for mine, others in zip(rows[::2], rows[1::2], strict=True):
+        assert np.array_equal(mine, others)
 
 
 @pytest.mark.parametrize("kind", ["perceptual", "recurrent", "film", "bank"])

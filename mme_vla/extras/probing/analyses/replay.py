@@ -15,7 +15,7 @@ from mme_vla.data.statistics import compute_norm_stats, normalised_states
 from mme_vla.errors import UserError, require
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.memory.base import Memory
-from mme_vla.memory.history import OnlineHistory
+from mme_vla.memory.history import OnlineHistory, TokenlessHistory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
@@ -179,7 +179,7 @@ def selection_sheets(
 ) -> Iterator[tuple[int, Image.Image]]:
     """Draw what `memory` remembers at the first execution step and at every `every`-th after it.
 
-    Selections need no weights: the tokens stored are empty.
+    Selections need no weights: no tokens are stored.
 
     Yields:
         (step, image); images grow with what is remembered.
@@ -198,9 +198,9 @@ def selection_sheets(
         part = frames[n_observed : step + 1]
         history.append(part, torch.zeros(len(history.to_encode(len(part))), patches, 1))
         n_observed = step + 1
-        selected = memory.select(history, step)
+        selected = memory.select(TokenlessHistory(history), step)
         title = (
-            f"{name} at step {step}: {len(selected)} of {memory.budget} tokens ·"
+            f"{name} at step {step}: {len(selected)} of {memory.capacity} tokens ·"
             f" {source.goal(episode, step)}"
         )
         yield (

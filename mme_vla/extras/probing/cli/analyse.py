@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
-from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
+from mme_vla.config.plugins import TRUST_FLAG, import_plugins, plugins_of, trust_as_flag
 from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError, check_choice, counted, require
 from mme_vla.policy.sections import PolicySections
@@ -178,12 +178,14 @@ def recurrence(args: argparse.Namespace) -> None:
     print(f"wrote {path} and {table}")
 
 
-def _memory(name: str, words: Sequence[str]) -> "Memory":
-    """A memory of `mme-vla inspect`, with overrides."""
+def _memory(name: str, args: argparse.Namespace) -> "Memory":
+    """A memory of `mme-vla inspect`, with the overrides of `--set`."""
     from mme_vla.cli.inspect import Inspection, build_memory
     from mme_vla.config.composition import compose, resolved
 
-    config = resolved(compose("inspect", [f"memory={name}", *words]))
+    trees = [args.config_dir] if args.config_dir else []
+    config = resolved(compose("inspect", [f"memory={name}", *args.set], extra_dirs=trees))
+    import_plugins(plugins_of(config, "the configuration"))
     return build_memory(Inspection.from_config(config))
 
 
@@ -194,7 +196,7 @@ def selection(args: argparse.Namespace) -> None:
     from mme_vla.utils.media import write_video
 
     source = EpisodeSource(args.dataset)
-    memory = _memory(args.memory, args.set)
+    memory = _memory(args.memory, args)
     sheets = []
     with _rerun(args) as log:
         for step, sheet in selection_sheets(source, args.episode, memory, args.memory, args.every):
@@ -297,7 +299,7 @@ def writing(args: argparse.Namespace) -> None:
     policy: MMEPolicy | None = None
     selectors: dict[str, Memory | str] = {}
     for name in args.memories:
-        selectors[name] = name if name in REFERENCES else _memory(name, args.set)
+        selectors[name] = name if name in REFERENCES else _memory(name, args)
     if args.checkpoint is not None:
         policy = MMEPolicy.from_pretrained(
             resolve_checkpoint(args.checkpoint), trust_plugins=args.trust_plugins
@@ -373,7 +375,13 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
         " learns."
     )
     policy = mme_of(
-        build_policy(args.model, backbone=args.backbone, device=device), "This analysis"
+        build_policy(
+            args.model,
+            config_dir=args.config_dir,
+            backbone=args.backbone,
+            device=device,
+        ),
+        "This analysis",
     )
     return policy, EpisodeSource(args.dataset), args.model
 
@@ -438,6 +446,13 @@ def _parser() -> argparse.ArgumentParser:
             metavar="MODULE",
             help="your own modules, imported first",
         )
+        if run is not cost:
+            made.add_argument(
+                "--config-dir",
+                type=Path,
+                metavar="DIR",
+                help="search YAML files of your own too",
+            )
         if run not in (cost, writing):
             made.add_argument(
                 "--rerun",
