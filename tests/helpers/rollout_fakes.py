@@ -16,7 +16,7 @@ from helpers.scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout import evaluation
-from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
+from mme_vla.evaluation.rollout.environment import ChunkEnv, EpisodeFactory
 from mme_vla.evaluation.rollout.evaluation import Evaluation, EvaluationRun, RunOptions
 from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -60,7 +60,7 @@ class InlineEnvs:
         return bool(self._replies)
 
     def start(self, worker: int, job: Job, **how: Any) -> None:
-        env = make_rollout_env(job.task, job.split, job.episode, **self._options)
+        env = EpisodeFactory(**self._options)(job.task, job.split, job.episode)
         self.made[job] = env._env
         self._running[worker] = (job, env)
         self._replies.append(Reply.of_outcome(worker, job, True, env.reset(**how)))

@@ -5,7 +5,6 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Unpack
 
@@ -25,7 +24,7 @@ from mme_vla.evaluation.records import (
     merge,
     read_records,
 )
-from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
+from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, Waiting, Workload
@@ -456,26 +455,19 @@ class EvaluationRun:
 
     def _environments(self, workers: int) -> VecEnv:
         settings = self.settings
-        info = self.policy.info
-        base = self.options.base
-        if base is make_env:
-            base = base_env(
-                settings.env,
-                self.policy.embodiment,
-                settings.render,
-                only_possible=settings.only_possible,
-            )
         videos = None
         if settings.video != "none":
             videos = (str(self.folder / VIDEOS), settings.video)
-        make = partial(
-            make_rollout_env,
-            base=base,
+        make = EpisodeFactory(
+            self.policy.embodiment,
+            settings.env,
+            self.options.base,
+            render=settings.render,
+            only_possible=settings.only_possible,
             max_steps=settings.limit_of,
+            max_actions=settings.max_actions or self.policy.info.max_actions,
             videos=videos,
             run=self.facts.label,
-            robot=self.policy.embodiment,
-            max_actions=settings.max_actions or info.max_actions,
         )
         # It begins without jobs: `Waiting` hands them out.
         return VecEnv([], workers, make, settings.timeout_s)
