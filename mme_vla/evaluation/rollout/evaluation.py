@@ -1,7 +1,6 @@
 """A whole evaluation, from `mme_vla.evaluate` to the records in the run's folder."""
 
 import logging
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, counted
+from mme_vla.evaluation.claims import ALONE, Claims, Shard, Waiting, check_sharing
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import (
     EpisodeRecord,
@@ -27,13 +27,11 @@ from mme_vla.evaluation.records import (
 from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
-from mme_vla.evaluation.rollout.runner import Rollout, Waiting, Workload
+from mme_vla.evaluation.rollout.runner import Rollout, Workload
 from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
-    RECORDS,
-    Claims,
     check_run_folder,
     claim_run,
     fingerprint,
@@ -49,19 +47,6 @@ from mme_vla.utils import remove_drafts, safe_name
 
 logger = logging.getLogger("mme_vla.evaluate")
 VIDEOS = "videos"
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One of several processes that share a run."""
-
-    index: int = 0
-    count: int = 1
-
-    @property
-    def file(self) -> str:
-        """Name of the file its records go to."""
-        return RECORDS if self.count == 1 else f"episodes-{self.index}of{self.count}.jsonl"
 
 
 class Evaluation(NamedTuple):
@@ -105,7 +90,7 @@ class RunOptions:
     """
 
     subgoals: SubgoalPredictor | None = None
-    shard: Shard = Shard()
+    shard: Shard = ALONE
     source: str | None = None
     base: Callable[..., Any] = make_env
     notes: Mapping[str, Any] | None = None
@@ -192,26 +177,6 @@ def choose_episodes(
         Job(spec.task, spec.split, spec.episode)
         for spec in choose_specs(tasks, episodes, split, env)
     ]
-
-
-def choose_shard(text: str | None, variables: Mapping[str, str] | None = None) -> Shard:
-    """Read `0/4` (the first of four), or the rank of this process under torchrun.
-
-    text: wins over them.
-    variables: of the environment; None: the process's own.
-    """
-    if variables is None:
-        variables = os.environ
-    if text is None:
-        if "RANK" not in variables or "WORLD_SIZE" not in variables:
-            return Shard()
-        text = f"{variables['RANK']}/{variables['WORLD_SIZE']}"
-    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
-    if match is None or int(match[1]) >= int(match[2]):
-        raise UserError(
-            f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4."
-        )
-    return Shard(int(match[1]), int(match[2]))
 
 
 def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
@@ -379,6 +344,7 @@ class EvaluationRun:
         content = claim_run(self.folder, decisive, options.notes)
         workload = Workload()
         with RecordLog(self.folder / options.shard.file) as log:
+            check_sharing(self.folder, log.path.name)
             remove_drafts(self.folder / VIDEOS)  # videos of workers that were killed
             done = self._records()
             finished_keys = finished(done)
@@ -388,24 +354,18 @@ class EvaluationRun:
             workers = self.settings.worker_count(-(-len(missing) // options.shard.count))
             workers = min(workers, self.policy.info.max_running or workers)
 
-            completed = [record for record in done if record.outcome != "error"]
-            name = options.name or self.facts.label
-            with RolloutProgress(
-                len(self.jobs), completed, options.show_progress, name
-            ) as progress:
-                if completed:
-                    progress.say(
-                        f"{self.folder} holds {len(completed)} of"
-                        f" {counted(len(self.jobs), 'episode')}: continuing with the others"
-                    )
+            forecast = None
+            if options.show_forecast:
                 forecast = durations.forecast(missing, workers, options.shard.count)
-                if forecast and options.show_forecast:
-                    progress.say(str(forecast))
+            before = [record for record in done if record.outcome != "error"]
+            name = options.name or self.facts.label
+            with RolloutProgress(len(self.jobs), before, options.show_progress, name) as progress:
+                progress.announce(self.folder, forecast)
                 if missing:
                     workload = self._roll_out(missing, workers, content, log, progress)
         return Evaluation(self._records(options.shard), workload, self.folder)
 
-    def _records(self, shard: Shard = Shard()) -> list[EpisodeRecord]:
+    def _records(self, shard: Shard = ALONE) -> list[EpisodeRecord]:
         """The folder's records of these episodes; of one of several shards, only its own file's."""
         keys = {(job.task, job.episode) for job in self.jobs}
         files = sorted(self.folder.glob("episodes*.jsonl"))

@@ -6,7 +6,7 @@ Each worker executes its chunk at its own pace, and joins the policy's next batc
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -17,6 +17,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError
+from mme_vla.evaluation.claims import Waiting
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import ChunkCommand
 from mme_vla.evaluation.rollout.failures import FailureStreaks
@@ -24,40 +25,9 @@ from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
-from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy, frames_a_piece
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.subgoal import SubgoalPredictor
-
-
-class Waiting:
-    """Episodes in the order they begin.
-
-    jobs: all that are left.
-    claims: where other processes run the same ones; each then begins what it could claim.
-    """
-
-    def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
-        self._jobs = list(jobs)
-        self._claims = claims
-        self._again: list[Job] = []
-
-    def take(self) -> Job | None:
-        """The next episode to begin, if there is one; those tried again come last."""
-        job = None
-        if self._claims is not None:
-            job = self._claims.take(self._jobs)
-            if job is not None:
-                self._jobs.remove(job)
-        elif self._jobs:
-            job = self._jobs.pop(0)
-        if job is None and self._again:
-            job = self._again.pop(0)
-        return job
-
-    def put_back(self, job: Job) -> None:
-        """Have an episode run once more, by this process."""
-        self._again.append(job)
 
 
 class Environments(Protocol):
