@@ -1,5 +1,6 @@
 """The training dataset: one item is one step of an execution phase."""
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -225,8 +226,11 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         decisions = self.sources[source].decisions(episode)
         if not self.processor.samples.full_chunks_only:
             return decisions
-        short = self.processor.embodiment.action.horizon - 1
-        return decisions[: max(len(decisions) - short, 0)]
+        horizon = self.processor.embodiment.action.horizon
+        if self.sources[source].robot.action.frames is None:  # a motion for each decision
+            return decisions[: max(len(decisions) - horizon + 1, 0)]
+        last = int(self.sources[source].lengths[episode]) - horizon - self.action_offset
+        return decisions[: bisect_right(decisions, last)]
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, which the random part of items depends on."""
@@ -293,7 +297,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         if source.robot.action.frames is None:
             return source.past_actions(step.episode, step.index, most, self.action_offset)
         now = int(frames.transformed(np.array(step.index)))
-        rows = frames.real[max(frames.exec_start, now - most) : now] + self.action_offset
+        # Each frame of the execution brings the action that led to it, also where it is repeated.
+        executed = frames.real[frames.exec_start : now + 1]
+        executed = executed[executed > step.exec_start]
+        rows = executed[max(len(executed) - most, 0) :] - 1 + self.action_offset
         if not len(rows):
             return source.past_actions(step.episode, step.index, 0, self.action_offset)
         return source.actions(step.episode, int(rows[0]), int(rows[-1]) + 1)[rows - rows[0]]

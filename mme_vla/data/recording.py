@@ -127,21 +127,25 @@ class Recording:
         """
         if stop <= start:
             return
+        has_one_a_frame = self.source.robot.action.frames is not None
+        begun = self.exec_start + 1
+        if has_one_a_frame and not video and start < begun < stop:
+            # No action of the robot led to the first frame of the execution, as after a reset.
+            self.show(running, start, begun, required)
+            self.show(running, begun, stop, required)
+            return
         if not video:
             running.options = self.source.options(self.episode)
-        views, rendered = self.views(start, stop, required)
         frames = np.arange(start, stop)
-        executed = frames[frames >= self.exec_start]
-        if video:
-            actions = None
-        elif self.source.robot.action.frames is None:
-            n_observed = len(self.source.past_actions(self.episode, start - 1, self.length))
-            actions = self.source.past_actions(self.episode, stop - 1, self.length)[n_observed:]
-        else:
-            before = np.maximum(executed - 1 + self.action_offset, 0)
-            actions = self.source.actions(self.episode)[before]
         demo = np.ones(len(frames), bool) if video else frames < self.exec_start
+        actions = None
+        if not video and not has_one_a_frame:
+            done = self.source.past_actions(self.episode, start - 1, self.length)
+            actions = self.source.past_actions(self.episode, stop - 1, self.length)[len(done) :]
+        elif not video and start >= begun:
+            actions = self.source.actions(self.episode)[frames - 1 + self.action_offset]
         states = self.source.states(self.episode, start, stop)
+        views, rendered = self.views(start, stop, required)
         if rendered is None:
             running.observe(views, states, demo, actions)
         else:

@@ -4,6 +4,7 @@ runs.
 
 import fcntl
 import os
+import time
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, fields, replace
@@ -265,6 +266,9 @@ _OF_ROLLOUTS = {spec.name: spec.default for spec in fields(EpisodeRecord) if spe
 """Field that is not written at its default → that."""
 
 
+_PROBED_S = 1.0  # other shards lock the file for a moment, to see who is alive (`claims.Claims`)
+
+
 class RecordLog:
     """Appends records to a file of this process, each on disk when `append` returns."""
 
@@ -307,15 +311,20 @@ class RecordLog:
 
     def _lock(self) -> None:
         # The records themselves are locked, so that no other file lies beside them.
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(
-                f"{self.path} is being written by another process; give every shard a file of its"
-                " own, episodes-<shard>.jsonl."
-            ) from None
-        except OSError:  # a file system without locks
-            return
+        until = time.monotonic() + _PROBED_S
+        while True:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic() >= until:
+                    raise UserError(
+                        f"{self.path} is being written by another process; give every shard a file"
+                        " of its own, episodes-<shard>.jsonl."
+                    ) from None
+            except OSError:  # a file system without locks
+                return
+            time.sleep(0.01)
 
     def _repair(self) -> None:
         self._file.seek(0)
@@ -355,7 +364,7 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     for new in records:
         at = (new.run, new.key)
         old = merged.get(at)
-        if old is None or (old.outcome == "error" and new.outcome != "error"):
+        if old is None:
             merged[at] = new
             continue
         require(
@@ -364,6 +373,9 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             f" {new.seed}: these are not the same benchmark; evaluate both from the same episode"
             " metadata.",
         )
+        if old.outcome == "error" and new.outcome != "error":
+            merged[at] = new
+            continue
         if new.outcome == "error":
             continue
         scenes = {new.named_scene, old.named_scene} - {None}

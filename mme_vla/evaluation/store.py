@@ -60,6 +60,11 @@ def claim_run(
         What `run.json` holds. Several shards may claim the same folder at once: the first writes
         it.
     """
+    for packed in sorted(folder.glob("episodes*.jsonl.xz")):
+        raise UserError(
+            f"{packed} is compressed, and a run continues with plain records: unpack it (xz -d), or"
+            " choose another folder."
+        )
     settings = to_json(settings)  # as they will be read back
     content = {
         "settings": settings,

@@ -421,10 +421,10 @@ class PromptConditionedHistory(DerivedHistory):
 
     def __init__(self, source: History, with_prompt: Callable[[Tensor], Tensor]) -> None:
         super().__init__(source)
-        self._with_prompt = with_prompt
+        self.with_prompt = with_prompt
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._with_prompt(self._source.gather(indices)[None])[0]
+        return self.with_prompt(self._source.gather(indices)[None])[0]
 
     def stored(self, indices: np.ndarray) -> Tensor:
         return self._source.stored(indices)

@@ -16,7 +16,14 @@ from mme_vla.memory.base import (
     pad_selection,
     union_frames,
 )
-from mme_vla.memory.history import DerivedHistory, FrameScorer, FrameScores, History, StorageSpec
+from mme_vla.memory.history import (
+    DerivedHistory,
+    FrameScorer,
+    FrameScores,
+    History,
+    PromptConditionedHistory,
+    StorageSpec,
+)
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens, ReadsLabels, labels_read
 
@@ -216,14 +223,15 @@ class CoarserHistory(DerivedHistory):
         return FrameScores(scores.frames, rows.reshape(-1, grid**2))
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._pooled(indices, self._source.gather)
+        tokens = self.stored(indices)
+        if isinstance(self._source, PromptConditionedHistory):
+            # As in training, the prompt conditions tokens that are pooled.
+            tokens = self._source.with_prompt(tokens[None])[0]
+        return tokens
 
     def stored(self, indices: np.ndarray) -> Tensor:
-        return self._pooled(indices, self._source.stored)
-
-    def _pooled(self, indices: np.ndarray, gather: Callable[[np.ndarray], Tensor]) -> Tensor:
         fine = self._source.spec.grid
-        tokens = gather(finer(indices, self.spec.grid, fine))
+        tokens = self._source.stored(finer(indices, self.spec.grid, fine))
         parts = (fine // self.spec.grid) ** 2
         if parts == 1:
             return tokens

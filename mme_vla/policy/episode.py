@@ -55,6 +55,8 @@ class Episode:
         """Images (None: not rendered) and states of the observation's window, the current frame
         last.
         """
+        self._acted = False
+        """Whether the policy acted at the newest of these."""
         self._video_over = False
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
@@ -152,10 +154,13 @@ class Episode:
                 new_frames.append((images_of_frame, torch.from_numpy(states[i].copy())))
         if not self._video_over and not demo[-1]:
             self._recent = []  # frames of the video are not in a window of the execution
+        if not samples.consecutive and not self._acted:
+            self._recent = self._recent[:-1]  # the end of a piece, at which nothing was decided
         self._take(views[self._robot.memory_camera], demo, executed, states)
         if self._past is not None:
             self._past.take(views)
         self._recent = [*self._recent, *new_frames][-samples.window :]
+        self._acted = False
 
     def add_frames(
         self,
@@ -227,6 +232,7 @@ class Episode:
         images = processor.images([views[name] for name in names])
         newest = (images, torch.from_numpy(state.copy()))
         self._recent = [*self._recent, newest][-processor.samples.window :]
+        self._acted = False
 
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -359,6 +365,7 @@ class Episode:
         executed.
         """
         self._chunk = chunk
+        self._acted = True
         self.action_prefix = None
 
     @property

@@ -164,12 +164,35 @@ class MMEVLAModelServer(PredictModelServer):
 
     def predict_batch(
         self, obs_batch: list[dict[str, Any]], ctx_batch: list[SessionContext]
-    ) -> list[dict[str, np.ndarray]]:
-        """Choose the chunks of these sessions in one batch."""
+    ) -> list[dict[str, Any]]:
+        """Choose the chunks of these sessions in one batch.
+
+        A session whose frames or words cannot be read fails alone: its result holds the error.
+        """
+        results: list[dict[str, Any]] = []
         episodes = []
         for obs, ctx in zip(obs_batch, ctx_batch, strict=True):
-            episodes.append(self._caught_up(obs, ctx))
-        return [{"actions": chunk} for chunk in self.policy.act(episodes, self.flow_steps)]
+            try:
+                episodes.append(self._caught_up(obs, ctx))
+                results.append({})
+            except Exception as error:
+                results.append({"error": error})
+        chunks = iter(self.policy.act(episodes, self.flow_steps))
+        for result in results:
+            if not result:
+                result["actions"] = next(chunks)
+        return results
+
+    def _normalize_result(self, result: dict[str, Any], ctx: SessionContext) -> dict[str, Any]:
+        """The harness's own, called for each session by itself.
+
+        Raises:
+            Exception: the error of this session.
+        """
+        if "error" in result:
+            raise result["error"]
+        normalized: dict[str, Any] = super()._normalize_result(result, ctx)
+        return normalized
 
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
         """A session's episode, after it has taken the frames since its last chunk."""
@@ -189,6 +212,7 @@ class MMEVLAModelServer(PredictModelServer):
         for name in frames[0]:
             views[name] = np.stack([images[name] for images in frames])
         episode.observe(views, np.stack(states))
+        _ = episode.prompt  # words that cannot be read fail here, and not in a batch with others
         return episode
 
 

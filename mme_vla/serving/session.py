@@ -275,9 +275,12 @@ class HttpSessions:
         entry.requests += 1
         try:
             async with entry.lock:
-                if self.entries.get(name) is not entry and not _begins(request):
-                    raise NoEpisodeError(LOST)  # a request before this one failed
-                return await entry.session.respond(request, begun)
+                if self.entries.get(name) is entry:
+                    return await entry.session.respond(request, begun)
+            # A request before this one failed and ended the session.
+            if _begins(request):
+                return await self.respond(name, request, begun)
+            raise NoEpisodeError(LOST)
         except Exception as error:
             if not isinstance(error, UserError) or not entry.session.intact:
                 self.drop(name, entry)

@@ -121,16 +121,22 @@ class OpenLoop:
 
 def decisions_of(recording: Recording, execute: int, most: int | None) -> list[int]:
     """The frames at which the policy acts in an open-loop check: every `execute`-th step, as in a
-    real episode, spread evenly where they are more than `most`.
+    real episode, spread evenly where they are more than `most`. Each has a recorded action.
 
     Raises:
         UserError: the episode has none.
     """
-    steps = recording.decisions(execute, most)
+    source = recording.source
+    episode = recording.episode
+    steps = []
+    for step in recording.decisions(execute, most):
+        _, is_known = source.action_chunk(episode, step, 1, recording.action_offset)
+        if is_known.any():
+            steps.append(step)
     require(
         steps,
-        f"Episode {recording.episode} of {recording.source.name} has no step at which this robot"
-        " decides: choose another episode.",
+        f"Episode {episode} of {source.name} has no step at which this robot decides and an action"
+        " is recorded: choose another episode.",
     )
     return steps
 

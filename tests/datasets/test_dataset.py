@@ -24,6 +24,7 @@ from mme_vla.data.sources import split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
+from mme_vla.processing.base import SampleSpec
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.prompt import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
@@ -254,3 +255,13 @@ def test_impossible_splits_are_refused(data) -> None:
     ):
         with pytest.raises(UserError, match=message):
             split_episodes(data[0], **options)
+
+
+@pytest.mark.parametrize("offset", [0, 1])
+def test_full_chunks_alone_are_full_whatever_the_offset(data, processor, monkeypatch, offset):
+    monkeypatch.setattr(Processor, "samples", SampleSpec(full_chunks_only=True))
+    dataset = TrainingDataset(data[0], processor, action_offset=offset)
+    steps = [dataset.step(index) for index in range(len(dataset))]
+    # Of 30 frames, six of them of the video; the other episodes are shorter than a chunk.
+    assert [step.index for step in steps] == list(range(6, 30 - 20 - offset + 1))
+    assert all(step.recorded.all() for step in steps)

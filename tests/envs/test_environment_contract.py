@@ -146,7 +146,8 @@ def test_settings_know_the_limit_of_each_task_unless_another_is_set() -> None:
     settings = RolloutSettings(env="corridors")
     assert settings.step_limit == 9 and settings.max_steps is None
     assert [settings.limit_of(task) for task in ("Short", "Wide")] == [4, 9]
-    assert RolloutSettings(env="corridors", max_steps=6).limit_of("Short") == 6
+    for limit in (6, 9):  # 9 is that of the longest task
+        assert RolloutSettings(env="corridors", max_steps=limit).limit_of("Short") == limit
     assert RolloutSettings().limit_of("StopCube") == 1300
 
 

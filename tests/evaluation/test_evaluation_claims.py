@@ -3,8 +3,10 @@ killed.
 """
 
 import errno
+import fcntl
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -93,6 +95,15 @@ def test_one_process_does_not_run_what_shards_share(
         else:
             check_sharing(tmp_path, second)
     check_sharing(tmp_path, second)
+
+
+def test_a_process_starts_while_another_looks_whether_it_is_alive(tmp_path: Path) -> None:
+    path = tmp_path / "episodes-0of2.jsonl"
+    path.touch()
+    with path.open("rb") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)  # as `Claims` does, for a moment
+        threading.Timer(0.1, looking.close).start()
+        RecordLog(path).close()
 
 
 @pytest.mark.slow

@@ -449,6 +449,9 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     assert points[0].interval == Interval(*(100 * bound for bound in wilson(0.75, 4, 0.95))), (
         "of four scenes"
     )
+    # A training without some of the event's episodes counts at no place with these.
+    (points,) = event_curves(made[:-2]).values()
+    assert [(p.turned, p.episodes) for p in points] == [(0, 6), (64, 6)]
 
 
 @pytest.mark.slow

@@ -174,6 +174,10 @@ def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
 def test_one_episode_in_two_environments_is_refused() -> None:
     with pytest.raises(UserError, match="seeds 540000 and 1"):
         merge([record(), record(seed=1)])
+    failed = record(seed=1, outcome="error")
+    for both in ([record(), failed], [failed, record()]):
+        with pytest.raises(UserError, match="not the same benchmark"):
+            merge(both)
 
 
 def test_a_run_of_two_step_limits_is_refused() -> None:
@@ -191,6 +195,13 @@ def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     ):
         claim_run(tmp_path, other)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
+
+
+def test_a_run_of_compressed_records_is_not_run_again(tmp_path: Path) -> None:
+    claim_run(tmp_path, {"a": 1})
+    (tmp_path / "episodes.jsonl.xz").write_bytes(b"")
+    with pytest.raises(UserError, match=r"episodes\.jsonl\.xz is compressed.*unpack it"):
+        claim_run(tmp_path, {"a": 1})
 
 
 def test_a_folder_of_something_else_is_not_filled_with_records(tmp_path: Path) -> None:

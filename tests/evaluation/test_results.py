@@ -35,6 +35,7 @@ from mme_vla.evaluation.results.tables import (
     comparison_table,
     leaderboard,
     overview,
+    runs_table,
     to_csv,
     to_latex,
     to_markdown,
@@ -422,6 +423,16 @@ def test_the_best_of_several_methods_is_named_with_those_that_solve_as_many(
     assert conclude(results, []) == [sentence]
 
 
+def test_every_figure_of_tasks_with_unequal_numbers_of_episodes_is_a_mean_over_tasks() -> None:
+    made = records("mine", {"StopCube": [1], "BinFill": [0] * 9})
+    results = aggregate(made, Protocol.of_records(made))
+    assert results.methods[0].average.mean == 50
+    assert runs_table(results).rows[0][-1] == "50.00"
+    assert conclude(results, [])[0].startswith(
+        "mine solves 50.0 % on average over 2 tasks, 10 episodes in all (95 % interval"
+    )
+
+
 def test_a_small_run_shows_what_it_has_within_eighty_columns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -586,6 +597,24 @@ def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(
     ).methods
     run = {"settings": {"model": "a", "checkpoint": 100}, "notes": {"policy": policy_facts(config)}}
     assert detail in training_details(methods, [run])
+
+
+def test_a_submission_knows_a_checkpoint_whose_number_was_written_as_a_text() -> None:
+    methods = aggregate(records("a", {"BinFill": [1] * 4, "MoveCube": [1] * 4}), SMALL).methods
+    facts = policy_facts({"memory": {"name": "ttt"}})
+    run = {"settings": {"model": "a", "checkpoint": "100"}, "notes": {"policy": facts}}
+    assert "policy: memory ttt" in training_details(methods, [run])
+    run["notes"] = {"policy": policy_facts({"served": {"model": "a"}})}
+    assert "no memory" not in training_details(methods, [run])
+
+
+def test_two_models_of_one_shipped_checkpoint_are_told_apart() -> None:
+    made = []
+    for name in ("framesamp_modul", "mine"):
+        made += records(name, {"VideoUnmask": [1]}, checkpoint="nano")
+    results = aggregate(made, Protocol.of_records(made))
+    assert [method.label for method in results.methods] == ["nano#framesamp_modul", "nano#mine"]
+    assert results.notes[0].startswith("2 different models are called nano")
 
 
 HOSTILE = "\x1b]0;title\x07\x1b[2J"

@@ -2,6 +2,7 @@
 is its zero.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,19 @@ def test_records_of_a_former_dial_still_have_a_curve() -> None:
     curves = stress_curves([*records("test", [1, 0]), *records("stress:sessions=2", [0, 0])])
     (points,) = curves.values()
     assert [(point.turned, point.won) for point in points] == [(0, 1), (2, 0)]
+
+
+def test_two_configurations_of_one_name_have_a_curve_each() -> None:
+    stress_records = []
+    for composition, won in (("first", 1), ("second", 0)):
+        for split in ("test", "stress:count=2"):
+            for record in records(split, [won, won]):
+                stress_records.append(replace(record, composition=composition))
+    curves = stress_curves(stress_records)
+    assert [[(p.turned, p.won, p.episodes) for p in points] for points in curves.values()] == [
+        [(0, 2, 2), (2, 2, 2)],
+        [(0, 0, 2), (2, 0, 2)],
+    ]
 
 
 def test_runs_are_drawn_in_the_order_of_their_records() -> None:

@@ -170,24 +170,30 @@ def test_samples_are_transformed_by_seed_epoch_and_index(sample: Any) -> None:
 
 
 def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A repeated frame repeats the action that led to it, as in a probe."""
     sources, processor, caches = sample
     data = TrainingDataset(sources, processor, LastFrames(), caches)
-    steps = (data.step(index) for index in range(20, len(data)))
-    step = next(
-        s
-        for s in steps
-        if len(np.unique(sources[0].actions(s.episode, s.index - 4, s.index), axis=0)) > 1
-    )
-    exec_start = int(sources[0].exec_starts[step.episode])
-    visible = map_frames(
-        [Pause(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index]
-    )
+    step = data.step(20)
+    start, now = step.exec_start, step.index
+    # Every action another one, so that each is told from its neighbours.
+    numbers = np.arange(sources[0].lengths[step.episode], dtype=np.float32)
+    monkeypatch.setattr(sources[0], "actions", lambda e, a, b: numbers[a:b, None])
     monkeypatch.setattr(Processor, "prompt_spec", replace(processor.prompt_spec, past_actions=4))
-    past = data.past_actions(step, visible)
-    repeated = sources[0].actions(step.episode, step.index - 1, step.index)
-    assert np.array_equal(past, np.repeat(repeated, 4, 0))
-    recorded = data.past_actions(step, map_frames((), step.index + 1, exec_start))
-    assert len(recorded) == 4 and not np.array_equal(recorded, past)
+
+    def past(*transforms: Perturbation) -> list[int]:
+        visible = map_frames(transforms, now + 1, start, keep=[now])
+        return data.past_actions(step, visible)[:, 0].astype(int).tolist()
+
+    assert past() == [now - 4, now - 3, now - 2, now - 1]
+    assert past(Pause(2, now - start - 1)) == [now - 2, now - 2, now - 2, now - 1]
+    assert past(Pause(5, now - start)) == [now - 1] * 4, "not the action that is to be predicted"
+    assert past(Pause(5, 0)) == past()
+    later = TrainingDataset(sources, processor, LastFrames(), caches, action_offset=1)
+    visible = map_frames([Pause(5, now - start)], now + 1, start, keep=[now])
+    assert later.past_actions(step, visible)[:, 0].tolist() == [now] * 4
+    # No action led to the first frame of the execution, however long it is shown.
+    step, now = data.step(1), start + 1
+    assert past(Pause(5, 0)) == [start]
 
 
 def test_the_times_of_a_group_are_transformed(sample: Any) -> None:

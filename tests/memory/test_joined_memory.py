@@ -13,6 +13,7 @@ from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli import inspect
 from mme_vla.config.composition import compose
 from mme_vla.memory.base import stack_history
+from mme_vla.memory.history import PromptConditionedHistory
 from mme_vla.memory.joined import JoinedMemory, finer
 from mme_vla.registry import MEMORIES
 from mme_vla.testing import check_memory
@@ -78,6 +79,19 @@ def test_every_member_replies_as_when_alone(members: list[Any]) -> None:
         assert error < 1e-5
         start += member.budget
     assert start == memory.budget == tokens.tokens.shape[1] <= 512
+
+
+@torch.no_grad()
+def test_the_prompt_conditions_the_same_tokens_in_training_and_in_an_episode() -> None:
+    """A member of a coarser grid reads pooled tokens, and the prompt changes these."""
+    memory = joined([FRAMES, {**FRAMES, "grid": 8}]).eval()
+    episode = Episode(memory, 20)
+    selection = stack_history([memory.gather_selection(episode.cached(), 19)])
+    trained = memory(memory.condition_on_prompt(selection, torch.relu))
+    history = PromptConditionedHistory(episode.cached(), torch.relu)
+    met = memory.encode([history], [memory.start_stream()])
+    assert torch.equal(met.mask, trained.mask)
+    assert torch.equal(met.tokens[met.mask], trained.tokens[trained.mask])
 
 
 def test_budgets_are_shared_evenly_or_as_configured() -> None:

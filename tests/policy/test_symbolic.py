@@ -9,6 +9,7 @@ import pytest
 from mme_vla import UserError, build_policy
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.recording import Recording
 from mme_vla.memory.transforms import map_frames
 from mme_vla.processing.prompt import POINT, SubgoalText, perturb_point
 from mme_vla.testing.small import moving_frames, small_policy
@@ -115,6 +116,25 @@ def test_past_actions_of_training_are_the_ones_right_before_the_chunk(source):
     assert np.array_equal(past(later, 3), source.actions(0, start + 1, start + 4))
     assert int(data[40]["prompt_mask"].sum()) < 640, "all 128 numbers fit"
     assert len(re.findall(r"\d+", words(policy, data[40]).split("Past actions:")[1])) == 128
+
+
+@pytest.mark.parametrize("offset", [0, 1])
+def test_a_recording_shows_the_past_actions_that_training_reads(source, offset):
+    policy = small_policy("pi05_past_actions")
+    data = TrainingDataset([source], policy.processor, action_offset=offset)
+    recording = Recording(source, 0, offset)
+    start = recording.exec_start
+    no_frames = np.zeros(0, np.int64)
+    for index in (0, 1, 20):
+        identity = map_frames((), start + index + 1, start)
+        expected = data.past_actions(data.step(index), identity)
+        whole, stepwise = (policy.start_episode("press the button") for _ in range(2))
+        recording.show(whole, 0, start + index + 1, no_frames)
+        for first, stop in ((0, start - 3), (start - 3, start + 1), (start + 1, start + index + 1)):
+            recording.show(stepwise, first, stop, no_frames)
+        for episode in (whole, stepwise):
+            assert episode.n_observed_frames == start + index + 1
+            assert np.array_equal(episode._executed, expected), index
 
 
 def test_an_episode_knows_its_executed_actions_by_the_frames_that_follow():

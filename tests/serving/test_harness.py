@@ -221,6 +221,29 @@ def test_an_observation_without_images_ends_its_episode_alone(policy: MMEPolicy)
         through_the_harness(policy, [failing])
 
 
+def test_a_state_that_cannot_be_read_ends_its_episode_alone(policy: MMEPolicy) -> None:
+    broken, sound = Scripted(0), Scripted(1)
+    server = MMEVLAModelServer(policy)
+    contexts: list[Any] = []
+    observations = []
+    for number, benchmark in enumerate((broken, sound)):
+        context = SimpleNamespace(session_id=str(number))
+        running = harness.Running(policy.start_episode("", seed=42))
+        server.sessions[context.session_id] = running
+        seen = benchmark.observation()
+        if benchmark is broken:
+            seen["states"][:] = np.nan
+        images = {"front": seen["images"]["agentview"], "wrist": seen["images"]["wrist"]}
+        running.images.append(images)
+        running.states.append(seen["states"])
+        contexts.append(context)
+        observations.append(seen)
+    failed, answered = server.predict_batch(observations, contexts)
+    with pytest.raises(UserError, match="states must be finite"):
+        server._normalize_result(failed, contexts[0])
+    assert np.isfinite(answered["actions"]).all()
+
+
 def test_frames_that_cannot_be_read_are_not_read_again(policy: MMEPolicy) -> None:
     server = MMEVLAModelServer(policy)
     running = harness.Running(policy.start_episode("", seed=42))

@@ -5,6 +5,7 @@ of `serving/remote`, with good and with malformed replies.
 import re
 import socket
 import threading
+import time
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -470,8 +471,11 @@ def test_a_key_with_a_line_break_is_refused_and_not_repeated() -> None:
 class Peer:
     """A server that writes prepared bytes to its client, and holds the connection."""
 
-    def __init__(self, *parts: bytes, pause_s: float = 0, read: bool = True) -> None:
+    def __init__(
+        self, *parts: bytes, pause_s: float = 0, hold_s: float = 5, read: bool = True
+    ) -> None:
         self.parts = parts
+        self.hold_s = hold_s
         self.pause_s = pause_s
         self.read = read
         self.stop = threading.Event()
@@ -490,7 +494,7 @@ class Peer:
                     for part in self.parts:
                         stream.sendall(part)
                         self.stop.wait(self.pause_s)
-                    self.stop.wait(5)
+                    self.stop.wait(self.hold_s)
 
     def __enter__(self) -> "Peer":
         self.thread.start()
@@ -522,6 +526,15 @@ def test_http_takes_no_reply_that_is_cut_short_or_has_no_end(
         peer.stop.set()  # closes after what it has written
         with pytest.raises(ConnectionError, match="IncompleteRead"):
             HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=5)
+
+
+def test_http_connects_again_where_the_server_closed_a_silent_connection() -> None:
+    with Peer(b"HTTP/1.1 200 OK\r\nContent-Length: 1\r\n\r\n\x80", hold_s=0) as peer:
+        connection = HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=5)
+        time.sleep(0.2)  # seconds of simulation
+        assert connection.request({"reset": True}) == {}
+        connection.close()
+    assert peer.received.count(b"HTTP/1.1") == 2
 
 
 def test_http_sends_the_path_of_the_address() -> None:

@@ -291,6 +291,22 @@ def test_a_request_that_waited_does_not_continue_with_an_episode_that_failed_mea
     assert served.on_loop(meet())
 
 
+def test_a_reset_that_waited_begins_an_episode_that_later_requests_find(served):
+    sessions, name = served.server.sessions, ("127.0.0.1", "again")
+
+    async def meet():
+        first = sessions.find(name, Reset())
+        await first.lock.acquire()
+        waiting = asyncio.ensure_future(sessions.respond(name, Reset(), 0.0))
+        await asyncio.sleep(0)
+        sessions.drop(name)  # as an error of the request before it does
+        first.lock.release()
+        assert (await waiting)["reset_finished"]
+        return sessions.entries.pop(name, first) is first
+
+    assert not served.on_loop(meet())
+
+
 @pytest.mark.parametrize(
     "word",
     [

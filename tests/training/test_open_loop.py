@@ -189,3 +189,16 @@ def test_missing_subgoals_are_named(sample: EpisodeSource, tmp_path: Path) -> No
     )
     with pytest.raises(UserError, match="reads simple_subgoal, and data has no such column"):
         open_loop(policy, Recording(source, 0), "episode 0")
+
+
+def test_a_last_frame_that_no_action_follows_is_not_compared(policy: MMEPolicy) -> None:
+    """With data.action_offset=1 its chunk has no recorded action, and the errors would be NaN."""
+    source = EpisodeSource("sample")
+    last = int(source.lengths[0]) - 1
+    first = last - policy.embodiment.action.execute
+    source.exec_starts[0] = first
+    result = open_loop(policy, Recording(source, 0, 1), "two decisions")
+    assert result.steps.tolist() == [first] and result.valid.any(1).all()
+    source.exec_starts[0] = last
+    with pytest.raises(UserError, match="no step at which this robot decides and an action"):
+        open_loop(policy, Recording(source, 0, 1), "one frame")

@@ -333,6 +333,7 @@ def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[in
 def _tell_apart(methods: Sequence[Method]) -> list[str]:
     """Give methods of one name but different configurations labels of their own, and say so."""
     kinds = {
+        "model": "models",  # of a shipped checkpoint, which goes by the checkpoint's name
         "composition": "configurations",
         "recipe": "recipes of training",
         "data": "datasets",
@@ -350,17 +351,19 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
         lacking = False
         for method in same:
             for name in names:
-                digest = getattr(method, name)
-                lacking = lacking or digest is None
-                method.label += f"#{(digest or 'unrecorded')[:10]}"
+                value = getattr(method, name)
+                lacking = lacking or value is None
+                if name != "model":  # a digest
+                    value = (value or "unrecorded")[:10]
+                method.label += f"#{value}"
         if "composition" in names:
             what = kinds["composition"]
         else:
             what = " and ".join(kinds[name] for name in names)
         note = (
             f"{len(same)} different {what} are called {label}; they are not averaged:"
-            f" {', '.join(method.label for method in same)} (the digest of"
-            f" `{'` and `'.join(names)}` in their records"
+            f" {', '.join(method.label for method in same)} (`{'` and `'.join(names)}` in their"
+            " records"
         )
         if lacking:
             note += "; records without it are of an earlier version"

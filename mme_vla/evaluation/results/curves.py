@@ -3,13 +3,15 @@ split is its zero.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from mme_vla.config.naming import digest
 from mme_vla.envs.metadata import BASE, read_variant
 from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
 from mme_vla.errors import require
@@ -18,6 +20,7 @@ from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Results, record_table
 from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.results.tables import Table, task_tables
+from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils.style import COLOURS, LINE, figure, svg
 
 
@@ -63,13 +66,27 @@ Curves = dict[tuple[str, str, str], list[Point]]  # (model, task, dial) → poin
 
 class Place(NamedTuple):
     """Where a record lies on a dial: the run at the dial's zero, the dial, how far it is turned,
-    and its zero.
+    and its zero. A record on no dial has an empty one.
     """
 
     run: RunKey
-    dial: str
-    turned: float
+    dial: str = ""
+    turned: float = 0
     zero: float = 0
+
+
+def run_names(runs: Iterable[RunKey]) -> dict[RunKey, str]:
+    """What curves call runs: `str(run)`, and behind it a digest where several would be called the
+    same.
+    """
+    names = {run: str(run) for run in runs}
+    counts = Counter(names.values())
+    for run, name in names.items():
+        if counts[name] > 1:
+            training = None if run.training is None else asdict(run.training)
+            kind = digest({"composition": run.composition, "training": training}, 6)
+            names[run] = f"{name}, #{kind}"
+    return names
 
 
 def stress_curves(
@@ -79,10 +96,10 @@ def stress_curves(
     zero.
     """
 
-    def place(record: EpisodeRecord) -> Place | None:
+    def place(record: EpisodeRecord) -> Place:
         variant = read_variant(record.split)
         if variant is None or not variant.dial:
-            return None
+            return Place(record.run)
         return Place(record.run._replace(split=BASE), variant.dial, variant.turned)
 
     curves = curves_of(merge(records, conflicts), place, confidence)
@@ -96,52 +113,51 @@ def stress_curves(
 
 def curves_of(
     records: Sequence[EpisodeRecord],
-    place: Callable[[EpisodeRecord], Place | None],
+    place: Callable[[EpisodeRecord], Place],
     confidence: float = 0.95,
     same_scenes: bool = False,
 ) -> Curves:
     """Success over every dial.
 
-    A point counts the episodes that the model has at every place of the dial: one curve is of the
-    same episodes.
+    A point counts the episodes that the model, of several trainings each, has at every place of the
+    dial: one curve is of the same episodes.
 
     records: merged.
-    place: where a record lies; None for a record that lies on none, or at the zero.
+    place: where a record lies; one on no dial is at the zero of its run.
     same_scenes: whether a dial leaves the scene as it is, so that only equal scenes are counted;
         one that changes the scene keeps the episode's number and seed alone.
     """
     table = record_table(records)
-    table["run"] = table["run"].map(str)
-    on_dial = []
-    places = []
-    for record in records:
-        at = place(record)
-        if at is not None:
-            on_dial.append(record)
-            places.append(at)
-    placed = record_table(on_dial)
-    placed[list(Place._fields)] = pd.DataFrame(places, columns=Place._fields)
-    placed["run"] = placed["run"].map(str)
+    places = [place(record) for record in records]
+    names = run_names(at.run for at in places)
+    table[list(Place._fields)] = pd.DataFrame(places, columns=Place._fields)
+    table["run"] = [names[at.run] for at in places]
+    is_placed = table["dial"] != ""
+    baselines = dict(list(table[~is_placed].groupby(["run", "task"])))
     curves: Curves = {}
-    for (run, task, dial, zero), members in placed.groupby(
+    for (run, task, dial, zero), members in table[is_placed].groupby(
         ["run", "task", "dial", "zero"], sort=False
     ):
-        points = dict(list(members.groupby("turned")))
-        baseline = table[(table["run"] == run) & (table["task"] == task)]
-        if zero not in points and not baseline.empty:
-            points[zero] = baseline
-        sides = []  # of each place, the records by episode
+        points = dict(list(members.groupby("turned")["record"]))
+        if zero not in points and (run, task) in baselines:
+            points[zero] = baselines[run, task]["record"]
+        sides: list[dict[tuple[TrainingIdentity | None, int], list[EpisodeRecord]]] = []
         for at in points.values():
-            sides.append(at.groupby("episode", sort=False)["record"].apply(list).to_dict())
+            side: dict[tuple[TrainingIdentity | None, int], list[EpisodeRecord]] = {}
+            for record in at:
+                side.setdefault((record.training, record.episode), []).append(record)
+            sides.append(side)
         common = set.intersection(*map(set, sides))
         if same_scenes:
             common = set(pair(sides).keys)
         if not common:
             continue
         curves[run, task, dial] = []
-        for turned in sorted(points):
-            at = points[turned]
-            share = count_successes(at[at["episode"].isin(common)], confidence)
+        for turned, side in sorted(zip(points, sides, strict=True), key=itemgetter(0)):
+            counted: list[EpisodeRecord] = []
+            for key in common:
+                counted += side[key]
+            share = count_successes(record_table(counted), confidence)
             point = Point(share.won, share.episodes, share.interval, turned)
             curves[run, task, dial].append(point)
     return curves

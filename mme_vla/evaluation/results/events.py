@@ -6,7 +6,6 @@ Trainings of one recipe on the same data are one row and one curve.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -146,20 +145,18 @@ def event_curves(
     """Success over the number of every event that has one; the plain run is at its
     neutral number.
     """
-    merged = []
-    for record in merge(records, conflicts):
-        merged.append(replace(record, training=without_seed(record.training)))
-    return curves_of(merged, _place, confidence, same_scenes=True)
+    return curves_of(merge(records, conflicts), _place, confidence, same_scenes=True)
 
 
-def _place(record: EpisodeRecord) -> Place | None:
+def _place(record: EpisodeRecord) -> Place:
+    recipe = record.run._replace(training=without_seed(record.training))
     word = None if record.event is None else split_word(record.event)
     if word is None or word.value is None:
-        return None
+        return Place(recipe)
     neutral = 0.0
     if word.name in PERTURBATIONS:
         neutral = PERTURBATIONS[word.name].neutral
     dial = word.name
     if word.unit is not None:
         dial += f"@{word.unit}:{word.number}"
-    return Place(record.run._replace(event=None), dial, word.value, neutral)
+    return Place(recipe._replace(event=None), dial, word.value, neutral)

@@ -21,7 +21,7 @@ from mme_vla.errors import SceneError
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import record_table, repeated_episodes
-from mme_vla.evaluation.results.curves import Share, count_successes, curve_figure
+from mme_vla.evaluation.results.curves import Share, count_successes, curve_figure, run_names
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
 from mme_vla.evaluation.results.statistics import Interval
@@ -250,7 +250,9 @@ def extrapolation(
             counted.append(record)
             amounts.append(amount)
     table = record_table(counted)
-    table["run"] = [str(run._replace(split=BASE)) for run in table["run"]]
+    runs = [run._replace(split=BASE) for run in table["run"]]
+    names = run_names(runs)
+    table["run"] = [names[run] for run in runs]
     table["amount"] = amounts
     curves: Extrapolation = {}
     for (run, task, amount), members in table.groupby(["run", "task", "amount"], sort=False):

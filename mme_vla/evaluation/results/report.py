@@ -10,6 +10,7 @@ from typing import Any
 
 from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.errors import counted
+from mme_vla.evaluation.records import checkpoint_number
 from mme_vla.evaluation.results import plots
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
@@ -186,8 +187,12 @@ def conclude(results: Results, comparisons: Sequence[Comparison]) -> list[str]:
     tasks = counted(len(protocol.averaged), "task")
     if len(protocol.averaged) == 1:
         tasks = protocol.averaged[0]
-    text = f"{best.label} solves {best.average.value:.1f} % of {counted(n_episodes, 'episode')}"
-    text += f" of {tasks}"
+    text = f"{best.label} solves {best.average.value:.1f} %"
+    lengths = {len(protocol.numbers_of(task)) for task in protocol.averaged}
+    if len(lengths) == 1 or best.average.mean is None:
+        text += f" of {counted(n_episodes, 'episode')} of {tasks}"
+    else:  # a mean over tasks of unequal numbers of episodes is no share of all episodes
+        text += f" on average over {tasks}, {counted(n_episodes, 'episode')} in all"
     if best.average.interval is not None:
         low, high = best.average.interval
         text += f" ({100 * protocol.confidence:g} % interval {low:.1f} to {high:.1f})"
@@ -241,7 +246,11 @@ RECIPE = {
 
 
 def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a policy's configuration states of it and of its training, for the notes of a run."""
+    """What a policy's configuration states of it and of its training, for the notes of a run;
+    nothing of a served policy, whose parts are the server's.
+    """
+    if "served" in config:
+        return {}
     card = config.get("card")
     card = card if isinstance(card, Mapping) else {}
     return {
@@ -273,7 +282,7 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
                 notes = content.get("notes") or {}
                 is_same = (
                     settings.get("model") == method.model
-                    and settings.get("checkpoint") == checkpoint
+                    and checkpoint_number(settings.get("checkpoint", "")) == checkpoint
                     and method.composition in (notes.get("composition"), None)
                 )
                 if is_same and notes.get("policy"):

@@ -107,8 +107,8 @@ def paired_interval(gaps: Mapping[str, np.ndarray], confidence: float = 0.95) ->
 
     The wider of two: Tango's score interval, and the share of unequal pairs times the exact
     interval of how many of them favour the first side. The second has 0 in it exactly where
-    `sign_test` has p ≥ 1 − confidence, so that interval and test never contradict each other. Of
-    no unequal pair nothing is known but that they are rare, which is what the first one states.
+    `sign_test` has p ≥ 1 − confidence: without 0 in the wider one the test is significant. Of no
+    unequal pair nothing is known but that they are rare, which is what the first one states.
 
     gaps: of each task, first side minus second of every pair, −1 … 1. Pairs of several runs have
         fractions, and count as so many pairs of single runs as their smaller spread is worth.

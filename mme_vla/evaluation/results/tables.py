@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
 from mme_vla.errors import counted, printable
@@ -204,7 +205,7 @@ def detail(method: Method, results: Results) -> Table:
 
 
 def runs_table(results: Results) -> Table:
-    """Every run: how far it is, how its episodes ended, and its average."""
+    """Every run: how far it is, how its episodes ended, and its average over the tasks."""
     columns = ["method", "checkpoint", "seed", "episodes"]
     counts: Counter[str] = Counter()
     named = False
@@ -224,7 +225,8 @@ def runs_table(results: Results) -> Table:
             row.append(f"{len(run.averaged)} of {run.expected}")
             row += [str(outcomes[name]) for name in outcome_names]
             if run.complete:
-                row.append(f"{100 * outcomes['success'] / run.expected:.2f}")
+                rates = [np.mean(run.successes(task) or []) for task in results.protocol.averaged]
+                row.append(f"{100 * np.mean(rates):.2f}")
             else:
                 row.append("incomplete")
             if named:

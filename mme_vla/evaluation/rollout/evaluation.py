@@ -79,7 +79,7 @@ class RunOptions:
 
     subgoals: predicts the subgoal, where the policy reads one.
     shard: which of how many processes this is; each takes the next episode that is free when it has
-        room (`store.Claims`).
+        room (`claims.Claims`).
     source: where the weights are from; part of what makes a run the same.
     base: makes an environment with the benchmark's interface; importable by name.
     notes: kept in `run.json` and never compared.

@@ -90,10 +90,9 @@ class RolloutSettings:
         """Actions until the outcome of a task is `timeout`: its own number unless another was
         set.
         """
-        source = environment(self.env)
-        if self.step_limit != source.step_limit(self.split):
-            return self.step_limit
-        return source.task_limit(task, self.split)
+        if self.max_steps is not None:
+            return self.max_steps
+        return environment(self.env).task_limit(task, self.split)
 
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""

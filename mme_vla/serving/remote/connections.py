@@ -1,6 +1,7 @@
 """Connections to servers: by websocket (`Client`), by HTTP, and with the harness's messages."""
 
 import http.client
+import select
 import socket
 import ssl
 import threading
@@ -112,6 +113,11 @@ class HttpConnection:
         late = threading.Event()
         is_open = False
         try:
+            if self._http.sock is not None:
+                waiting = select.poll()
+                waiting.register(self._http.sock, select.POLLIN)
+                if waiting.poll(0):  # the server closed it, as many do after seconds of silence
+                    self._http.close()
             if self._http.sock is None:
                 self._http.connect()
             stream = self._http.sock

@@ -104,7 +104,9 @@ def test_the_window_holds_consecutive_frames_or_those_it_was_requested_at() -> N
                 {name: of[frame : frame + 1] for name, of in images.items()}, states[[frame]], demo
             )
         assert torch.equal(in_pieces.window[1], first), "however it is observed"
-        episode.observe({name: of[3:] for name, of in images.items()}, states[3:])
+        policy.act(episode)
+        for piece in (slice(3, 6), slice(6, 9)):
+            episode.observe({name: of[piece] for name, of in images.items()}, states[piece])
         batches[consecutive] = episode.window[1][:, 0].tolist()
     assert batches == {True: [states[7, 0], states[8, 0]], False: [states[2, 0], states[8, 0]]}
     assert policy.act(episode).shape == (policy.horizon - 1, 8), (
