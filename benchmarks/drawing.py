@@ -25,7 +25,7 @@ from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.envs.robomme.recording.outputs import Job as Demonstration
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
-from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
+from mme_vla.evaluation.rollout.environment import ChunkEnv, EpisodeFactory
 from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
@@ -59,7 +59,7 @@ class InProcess:
         begun = time.process_time()
         self.close()
         self._job = job
-        self._env = make_rollout_env(job.task, job.split, job.episode, **self._options)
+        self._env = EpisodeFactory(**self._options)(job.task, job.split, job.episode)
         sensors = self._env._env.task.scene.sensors
         for camera, sensor in (
             ("front", sensors["base_camera"]),

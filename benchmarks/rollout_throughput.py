@@ -13,13 +13,12 @@ whatever it does.
 import argparse
 import time
 from dataclasses import dataclass
-from functools import partial
 
 from timing import machine
 
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
-from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
+from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
@@ -74,8 +73,7 @@ def measure(
     settings = RolloutSettings(
         max_steps=args.steps, workers=workers, max_batch=max_batch, render=not args.no_render
     )
-    base = base_env("mme_vla", policy.embodiment, render=not args.no_render)
-    make = partial(make_rollout_env, base=base)
+    make = EpisodeFactory(policy.embodiment, render=not args.no_render)
     facts = RunKey(args.model, "untrained", settings.seed)
     records: list[EpisodeRecord] = []
     with VecEnv([], workers, make) as envs:

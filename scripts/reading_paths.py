@@ -1,9 +1,9 @@
 """Files, functions and lines that a reader needs for seven questions about the library
 (docs/extend/layout.md).
 
-(a) and (d) read the tables of docs/extend/architecture.md, whose functions are counted; the others
-list the files on the way. Every file is checked to exist, and every function of (a), (d), (f) and
-(g) to be defined where it is listed.
+(a), (d) and (g) read the tables of docs/extend/architecture.md, whose functions are counted; the
+others list the files on the way. Every file is checked to exist, and every function of (a), (d),
+(f) and (g) to be defined where it is listed.
 
     python scripts/reading_paths.py
 """
@@ -21,7 +21,11 @@ TABLES = "docs/extend/architecture.md"
 LOSS = "### One loss, step by step"
 CHUNK = "### One chunk, step by step"
 EPISODE = "### One episode, step by step"
-"""The functions of (a), (d) and (g), in the order of reading."""
+"""The functions of (a), (d) and (g), in the order of reading. Beside those of (g): what is loaded
+(`policy/saving.py`), what a terminal shows (`evaluation/rollout/progress.py`), the run's folder
+(`evaluation/store.py`, and `claims.py` where processes share it), its receipt (`receipts.py`), and,
+where they are asked for, events, subgoals and videos (`evaluation/rollout/`).
+"""
 SELECTION = ["memory/tokendrop.py", "memory/history.py", "memory/base.py"]
 HEAD = ["backbone/flow.py"]
 TRAINING = [
@@ -33,22 +37,11 @@ TRAINING = [
 """From the command line to the last checkpoint of one process; `training/parallel.py` and
 `training/shards.py` are for several.
 """
-EVALUATION = [
-    ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
-    ("evaluation/rollout/evaluation.py", "run"), ("evaluation/rollout/runner.py", "rounds"),
-    ("envs/vector/pool.py", "recv"), ("envs/vector/pool.py", "serve"),
-    ("evaluation/rollout/environment.py", "step"), ("envs/interface.py", "step"),
-    ("evaluation/rollout/running.py", "read"), ("policy/episode.py", "observe"),
-    ("policy/scheduler.py", "next_steps"), ("policy/base.py", "act"),
-    ("evaluation/records.py", "to_json"), ("evaluation/records.py", "append"),
+EPISODE_BESIDE = [
+    ("cli/evaluate.py", "evaluate_one"), ("policy/scheduler.py", "Scheduler.next_steps"),
+    ("policy/base.py", "Policy.act"), ("envs/interface.py", "RoboMMEEnv.step"),
 ]  # fmt: skip
-"""From the command line to the line of an episode's record; (d) continues from `act`. Before it,
-what is loaded and built: the policy (`policy/saving.py`), and the task in its scene
-(`envs/make.py`, where `make_env` returns the `RoboMMEEnv` of `envs/interface.py`). Beside it: what
-a terminal shows (`rollout/progress.py`), the run's folder (`store.py`: `claim_run`, and `Claims`
-where several processes share a run), its receipt (`receipts.py`), and, where they are asked for,
-events (`rollout/events.py`), subgoals (`rollout/subgoals.py`) and videos (`rollout/video.py`).
-"""
+"""Functions that the rows of (g) name and do not list."""
 ALONE = "README.md"
 QUESTIONS = (
     "How does FrameSamp + Modulator work, from images and stored tokens to the loss?",
@@ -157,7 +150,6 @@ def answers() -> list[tuple[str, list[Path]]]:
     """What (a) to (g) take, and the files."""
     lines, modules = example()
     trained = defining(TRAINING)
-    evaluated = defining(EVALUATION)
     selection, head = (check([PACKAGE / n for n in names]) for names in (SELECTION, HEAD))
     return [
         chained(LOSS),
@@ -166,7 +158,7 @@ def answers() -> list[tuple[str, list[Path]]]:
         chained(CHUNK),
         (f"{lines} lines, {modules} modules imported", [ROOT / ALONE]),
         (count(trained), trained),
-        (count(evaluated), evaluated),
+        chained(EPISODE),
     ]
 
 

@@ -170,8 +170,10 @@ def _check_command_line(config_name: str, tree: Path, check: str) -> None:
             check_output(str(output))
         # What a plugin registers is known only once it is imported, which `job` does.
         named = plugins.plugins_of(cfg, "the configuration")
-        if check and not args.cfg and not named and not OmegaConf.missing_keys(cfg):
-            pkgutil.resolve_name(check)(resolved(cfg))
+        if check and not args.cfg and not named:
+            values = resolved(cfg)
+            if not OmegaConf.missing_keys(cfg):
+                pkgutil.resolve_name(check)(values)
 
 
 def _other_commands(words: Sequence[str], names: Names) -> str:

@@ -23,6 +23,7 @@ from mme_vla.config.sections import PathText, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
 from mme_vla.errors import check_choice
+from mme_vla.evaluation.claims import choose_shard
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, count_outcomes
 from mme_vla.evaluation.results.events import event_table, idle_events
 from mme_vla.evaluation.results.report import policy_facts
@@ -33,7 +34,6 @@ from mme_vla.evaluation.rollout.evaluation import (
     RunOptions,
     check_subgoals,
     choose_episodes,
-    choose_shard,
     evaluate_policy,
     kind_section,
 )

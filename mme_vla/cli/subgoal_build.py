@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from mme_vla.config.composition import resolved
 from mme_vla.config.sections import NonNegativeInt, PathText, read_section
 from mme_vla.errors import counted
 from mme_vla.subgoal.finetuning.collecting import build, open_input
@@ -30,7 +31,7 @@ class BuildSettings:
 
 def main(cfg: DictConfig) -> dict[str, int]:
     """Build what configs/subgoal_build.yaml and the command line say."""
-    settings = read_section(BuildSettings, OmegaConf.to_container(cfg, resolve=True), others=True)
+    settings = read_section(BuildSettings, resolved(cfg), others=True)
     options = read_section(
         RowOptions, settings.rows, "rows", noise=settings.noise, seed=settings.seed
     )

@@ -25,6 +25,7 @@ from hydra.errors import OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import InterpolationKeyError
 
 from mme_vla.config import plugins
 from mme_vla.config.naming import join_memories, several_memories
@@ -194,5 +195,17 @@ def join_plugins(
 
 
 def resolved(cfg: DictConfig) -> dict[str, Any]:
-    """A configuration as resolved plain values."""
-    return {str(key): value for key, value in OmegaConf.to_container(cfg, resolve=True).items()}  # type: ignore[union-attr]
+    """A configuration as resolved plain values.
+
+    Raises:
+        UserError: a value refers to a key that is not there.
+    """
+    try:
+        plain = OmegaConf.to_container(cfg, resolve=True)
+    except InterpolationKeyError as error:
+        detail = str(error).splitlines()[0]
+        raise UserError(
+            f"The value of {error.full_key} refers to another key: {detail}. Add that key to your"
+            " YAML file; a model's file says `name: <its name>`."
+        ) from None
+    return {str(key): value for key, value in plain.items()}  # type: ignore[union-attr]

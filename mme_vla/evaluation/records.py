@@ -267,7 +267,7 @@ _OF_ROLLOUTS = {spec.name: spec.default for spec in fields(EpisodeRecord) if spe
 """Field that is not written at its default → that."""
 
 
-_PROBED_S = 1.0  # other shards lock the file for a moment, to see who is alive (`store.Claims`)
+_PROBED_S = 1.0  # other shards lock the file for a moment, to see who is alive (`claims.Claims`)
 
 
 class RecordLog:

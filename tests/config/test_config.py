@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from helpers import commands
 from mme_vla.cli.command import check_overrides, options_first, run_configured
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
 from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.config.trees import library_files, library_trees
 from mme_vla.errors import UserError
@@ -315,3 +315,10 @@ def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_fr
         folder.name for tree in library_trees() for folder in tree.iterdir() if folder.is_dir()
     }
     assert not (set(tree) & folders) - selected
+
+
+def test_a_model_without_a_name_is_refused_by_the_key_that_lacks(tmp_path: Path) -> None:
+    text = "# @package _global_\ndefaults: [{/memory: none}, {/integration: none}]\n"
+    mine = write_tree(tmp_path / "mine", {"model/own.yaml": text})
+    with pytest.raises(UserError, match=r"value of output .* 'name' not found.*`name: "):
+        resolved(compose("train", ["model=own"], extra_dirs=[mine]))

@@ -44,8 +44,10 @@ def test_the_page_on_the_layout_has_the_counted_numbers() -> None:
             [
                 ("evaluation/rollout/evaluation.py", "EvaluationRun.run"),
                 ("envs/vector/pool.py", "serve"),
-                ("policy/scheduler.py", "Scheduler.next_steps"),
-                ("policy/base.py", "Policy.act"),
+                ("evaluation/rollout/environment.py", "EpisodeFactory.open"),
+                ("evaluation/rollout/running.py", "RunningEpisode.read"),
+                ("policy/episode.py", "Episode._take"),
+                ("evaluation/rollout/runner.py", "Rollout._act"),
                 ("evaluation/rollout/environment.py", "ChunkEnv.step"),
                 ("evaluation/records.py", "RecordLog.append"),
             ],
@@ -64,16 +66,13 @@ def test_a_function_that_a_file_lacks_stops_the_count() -> None:
         reading_paths.defining([("model.py", "MMEModel.encode")])
 
 
-def test_the_path_of_an_episode_passes_the_simulation_and_the_policy() -> None:
-    for call in (
-        ("envs/vector/pool.py", "serve"),
-        ("envs/interface.py", "step"),
-        ("policy/episode.py", "observe"),
-        ("policy/base.py", "act"),
-        ("evaluation/records.py", "append"),
-    ):
-        assert call in reading_paths.EVALUATION
-    assert len(reading_paths.defining(reading_paths.EVALUATION)) <= 12
+def test_the_files_on_the_path_of_an_episode_are_at_most_twelve() -> None:
+    path = reading_paths.chain(reading_paths.EPISODE) + reading_paths.EPISODE_BESIDE
+    assert len(reading_paths.defining(path)) <= 12
+    page = (REPOSITORY / "docs" / "extend" / "layout.md").read_text()
+    (row,) = [line for line in page.splitlines() if reading_paths.QUESTIONS[-1] in line]
+    for file, _ in reading_paths.EPISODE_BESIDE:
+        assert f"`{file}`" in row
 
 
 def test_the_functions_that_end_an_episode_exist() -> None:

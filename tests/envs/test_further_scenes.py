@@ -10,10 +10,9 @@ from mme_vla.cli.results import main
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import FURTHER, FURTHER_EPISODES, MORE, TASK_NAMES
 from mme_vla.errors import UserError
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.store import RecordLog
 
 
 def test_they_continue_where_the_rule_of_the_test_split_ends() -> None:

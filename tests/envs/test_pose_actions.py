@@ -22,7 +22,7 @@ from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episod
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.data.waypoints import find_motions
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollout.environment import ChunkCommand, base_env, make_rollout_env
+from mme_vla.evaluation.rollout.environment import ChunkCommand, EpisodeFactory
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.serving.server import PolicyServer
@@ -214,8 +214,7 @@ def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(
         actions = find_motions(rows, 0, panda.action.choice).targets
     elif panda.action.frames != 1:
         actions = find_motions(rows, 0).targets
-    base = base_env("mme_vla", panda, render=False)
-    env = make_rollout_env(task, "train", 8, base=base, robot=panda)
+    env = EpisodeFactory(panda, render=False)(task, "train", 8)
     _, first = env.reset()
     assert not chooses or first.options == recorded_options
     frames, _, terminated, _, report = env.step(ChunkCommand(actions))

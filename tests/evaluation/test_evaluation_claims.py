@@ -13,14 +13,13 @@ import pytest
 
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation import store
-from mme_vla.evaluation.records import EpisodeRecord, Seconds
+from mme_vla.evaluation import claims as claims_file
+from mme_vla.evaluation.claims import Claims, Waiting, check_sharing
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog, Seconds
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import compare
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.progress import Durations
-from mme_vla.evaluation.rollout.runner import Waiting
-from mme_vla.evaluation.store import Claims, RecordLog
 from mme_vla.utils import write_json
 
 JOBS = [Job("BinFill", "test", i) for i in range(4)]
@@ -29,7 +28,8 @@ TAKE_TWO = """
 import sys
 from pathlib import Path
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.store import Claims, RecordLog
+from mme_vla.evaluation.claims import Claims
+from mme_vla.evaluation.records import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
 folder = Path(sys.argv[1])
 log = RecordLog(folder / "episodes-0of2.jsonl")
@@ -72,8 +72,29 @@ def test_no_draft_is_written_where_another_claim_is_there(
     first, second = Claims(tmp_path, "episodes-0of2.jsonl"), Claims(tmp_path, "episodes-1of2.jsonl")
     with RecordLog(tmp_path / "episodes-0of2.jsonl"):
         assert taken(first.take(JOBS[:1])) == 0
-        monkeypatch.setattr(store, "_write_new", lambda path, text: pytest.fail("was written"))
+        monkeypatch.setattr(claims_file, "write_new", lambda path, text: pytest.fail("was written"))
         assert second.take(JOBS[:1]) is None
+
+
+@pytest.mark.parametrize(
+    "first, second, is_refused",
+    [
+        ("episodes.jsonl", "episodes-0of2.jsonl", True),
+        ("episodes-1of2.jsonl", "episodes.jsonl", True),
+        ("episodes-1of2.jsonl", "episodes-0of2.jsonl", False),
+    ],
+)
+def test_one_process_does_not_run_what_shards_share(
+    first: str, second: str, is_refused: bool, tmp_path: Path
+) -> None:
+    with RecordLog(tmp_path / first):
+        RecordLog(tmp_path / second).close()
+        if is_refused:
+            with pytest.raises(UserError, match=f"{first} is being written.*needs shard="):
+                check_sharing(tmp_path, second)
+        else:
+            check_sharing(tmp_path, second)
+    check_sharing(tmp_path, second)
 
 
 def test_a_process_starts_while_another_looks_whether_it_is_alive(tmp_path: Path) -> None:
@@ -134,11 +155,11 @@ def test_without_locks_the_process_number_decides(
     def no_locks(*_: object) -> None:
         raise OSError(errno.ENOLCK, "no locks")
 
-    monkeypatch.setattr(store.fcntl, "flock", no_locks)
+    monkeypatch.setattr(claims_file.fcntl, "flock", no_locks)
     (tmp_path / "episodes-0of2.jsonl").touch()
     write_json(
         tmp_path / "claims" / "BinFill-0.0.json",
-        vars(store.Claim("episodes-0of2.jsonl", process=process)),
+        vars(claims_file.Claim("episodes-0of2.jsonl", process=process)),
     )
     assert (Claims(tmp_path, "episodes-1of2.jsonl").take(JOBS[:1]) is None) == holds
 
@@ -162,7 +183,7 @@ def test_without_locks_the_process_number_decides(
 def test_a_damaged_claim_is_named(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store, "_await_content", lambda path: None)
+    monkeypatch.setattr(claims_file, "await_content", lambda path: None)
     joined = Claims(tmp_path, "episodes-0of2.jsonl")
     path = tmp_path / "claims" / "BinFill-0.0.json"
     path.parent.mkdir()

@@ -8,7 +8,6 @@ episodes.
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from mme_vla.evaluation.results.compare import common_episodes, compare
 from mme_vla.evaluation.results.events import event_curves, event_table
 from mme_vla.evaluation.results.ood import amount_of, twin_table
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.environment import make_rollout_env
+from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.extras.nano.board import Board, homogeneity
 from mme_vla.extras.nano.board_page import notes
 from mme_vla.extras.nano.page import compared
@@ -186,7 +185,7 @@ def test_every_record_names_its_scene_or_says_why_not(kind: Any, scene: str) -> 
     def make(task: str, split: str, episode: int, max_steps: int) -> Any:
         return kind(task, episode, max_steps, travel=1.0, step_s=0.0, dies="")
 
-    envs = LocalEnvs(partial(make_rollout_env, base=make, max_steps=8))
+    envs = LocalEnvs(EpisodeFactory(base=make, max_steps=8))
     (record,) = roll(quick_policy("pi05"), JOBS[:1], envs, retries=0, max_steps=8)
     assert record.scene == scene
     assert EpisodeRecord.from_json(record.to_json()) == record

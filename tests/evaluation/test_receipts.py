@@ -20,10 +20,10 @@ from mme_vla import UserError
 from mme_vla.cli.results import main
 from mme_vla.envs.base import environment
 from mme_vla.evaluation import receipts
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog
 from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import RecordLog, claim_run, fingerprint, read_records
+from mme_vla.evaluation.store import claim_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
 from mme_vla.policy.identity import checkpoint_label
 from mme_vla.policy.training_identity import TrainingIdentity

@@ -14,9 +14,16 @@ import mme_vla
 from mme_vla import UserError
 from mme_vla.cli import evaluate
 from mme_vla.config.composition import compose
-from mme_vla.evaluation.records import ARM, EpisodeRecord, Seconds, by_run, display_name, merge
-from mme_vla.evaluation.store import (
+from mme_vla.evaluation.records import (
+    ARM,
+    EpisodeRecord,
     RecordLog,
+    Seconds,
+    by_run,
+    display_name,
+    merge,
+)
+from mme_vla.evaluation.store import (
     check_run_folder,
     claim_run,
     find_records,

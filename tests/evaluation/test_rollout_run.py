@@ -19,19 +19,15 @@ from helpers.rollout_fakes import (
 )
 from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
-from mme_vla.envs.vector.pool import Job
+from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError
+from mme_vla.evaluation.claims import Claims, Shard, choose_shard
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
-from mme_vla.evaluation.rollout.evaluation import (
-    EvaluationRun,
-    RunOptions,
-    Shard,
-    choose_shard,
-    default_output,
-)
+from mme_vla.evaluation.rollout.environment import Report
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, default_output
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import Claims, find_records, read_records
+from mme_vla.evaluation.store import find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
 
 
@@ -175,8 +171,6 @@ def test_a_shard_comes_from_the_word_or_from_torchrun() -> None:
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
         def start(self, worker, job, **how):
-            from mme_vla.envs.vector.pool import Reply
-
             self._replies.append(Reply.of_failure(worker, job, True, self.kind("no scene")))
 
     envs = Broken(2)
@@ -191,6 +185,21 @@ def test_environments_that_cannot_begin_stop_the_run() -> None:
     envs.kind = SceneError
     many = [Job("VideoPlaceOrder", "reserved", episode) for episode in range(12)]
     assert [record.outcome for record in roll(quick_policy("pi05"), many, envs)] == ["error"] * 12
+
+
+def test_episodes_that_fail_before_the_first_chunk_stop_no_run() -> None:
+    class Brief(InlineEnvs):
+        """Episodes fail while an event holds the robot."""
+
+        def send(self, worker, action):
+            assert action.hold
+            job, _ = self._running[worker]
+            outcome = {}, 0.0, True, False, Report(status="fail")
+            self._replies.append(Reply.of_outcome(worker, job, False, outcome))
+
+    jobs = [Job("StopCube", "test", episode) for episode in range(10)]
+    records = roll(quick_policy("pi05"), jobs, Brief(2), event="pause:400@step:0")
+    assert [(record.outcome, record.chunks) for record in records] == [("fail", 0)] * 10
 
 
 def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(

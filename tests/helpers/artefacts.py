@@ -19,8 +19,8 @@ from mme_vla.data.cache_building import build_cache
 from mme_vla.data.convert import convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.embodiment import ROBOMME_JOINT
-from mme_vla.evaluation.records import EpisodeRecord, Seconds
-from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog, Seconds
+from mme_vla.evaluation.store import RECORDS, claim_run
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.rows import RowDataset

@@ -14,13 +14,13 @@ import pytest
 
 from helpers.scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.evaluation.records import EpisodeRecord, RunKey
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog, RunKey
 from mme_vla.evaluation.rollout import evaluation
-from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
+from mme_vla.evaluation.rollout.environment import ChunkEnv, EpisodeFactory
 from mme_vla.evaluation.rollout.evaluation import Evaluation, EvaluationRun, RunOptions
 from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import RECORDS, RecordLog
+from mme_vla.evaluation.store import RECORDS
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import SMALL_VISION, small_policy
 
@@ -44,7 +44,7 @@ class InlineEnvs:
 
     def __init__(self, workers: int = 1, **options: Any) -> None:
         self.workers = workers
-        self._options = {"base": make_scripted_env, "max_steps": 40, **options}
+        self.factory = EpisodeFactory(**{"base": make_scripted_env, "max_steps": 40, **options})
         self._replies: list[Reply] = []
         self._running: dict[int, tuple[Job, ChunkEnv]] = {}
         self.made: dict[Job, ScriptedEnv] = {}
@@ -60,7 +60,7 @@ class InlineEnvs:
         return bool(self._replies)
 
     def start(self, worker: int, job: Job, **how: Any) -> None:
-        env = make_rollout_env(job.task, job.split, job.episode, **self._options)
+        env = self.factory(job.task, job.split, job.episode)
         self.made[job] = env._env
         self._running[worker] = (job, env)
         self._replies.append(Reply.of_outcome(worker, job, True, env.reset(**how)))
@@ -78,7 +78,9 @@ def use_inline_envs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let an `EvaluationRun` step its environments in this process."""
 
     def inline(jobs: Any, workers: int, factory: Any, timeout: Any) -> InlineEnvs:
-        return InlineEnvs(workers, **factory.keywords)
+        envs = InlineEnvs(workers)
+        envs.factory = factory
+        return envs
 
     monkeypatch.setattr(evaluation, "VecEnv", inline)
 

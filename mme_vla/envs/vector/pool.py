@@ -19,6 +19,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import wait
@@ -159,7 +160,6 @@ class VecEnv:
         self._context = simulating_processes()
         self._closed = False
         self._workers: list[_Worker] = []
-        self._lost: list[Reply] = []
         try:
             for _ in range(workers):
                 self._workers.append(self._spawn())
@@ -177,7 +177,7 @@ class VecEnv:
     @property
     def busy(self) -> bool:
         """Whether a reply is still to come."""
-        return bool(self._lost) or any(worker.running for worker in self._workers)
+        return any(worker.running for worker in self._workers)
 
     def start_next(self, worker: int) -> Job | None:
         """Let a worker begin the next episode; None when there is none left."""
@@ -230,15 +230,14 @@ class VecEnv:
         if timeout is not None:
             until = time.monotonic() + timeout
         while True:
-            replies = self._lost
-            self._lost = []
+            replies = []
             for index, state in enumerate(self._workers):
                 if state.running:
                     reply = self._poll(index, state)
                     if reply is not None:
                         replies.append(reply)
             if replies or not self.busy or time.monotonic() >= until:
-                return sorted(replies, key=lambda reply: reply.worker)
+                return replies
             running = [state for state in self._workers if state.running]
             seconds = min([until, *(state.deadline for state in running)]) - time.monotonic()
             wait([state.connection for state in running], timeout=max(0.0, min(seconds, 60.0)))
@@ -280,8 +279,8 @@ class VecEnv:
         last = len(self._workers) - 1
         require(0 <= worker <= last, f"Unknown worker {worker}; expected 0 to {last}.")
         state = self._workers[worker]
-        is_idle = not state.running and all(reply.worker != worker for reply in self._lost)
-        require(is_idle, f"Worker {worker} is still at its last command; call recv() first.")
+        message = f"Worker {worker} is still at its last command; call recv() first."
+        require(not state.running, message)
         return state
 
     def _command(self, worker: int, *message: Any) -> None:
@@ -290,10 +289,8 @@ class VecEnv:
         state.deadline = time.monotonic() + self.timeout
         if state.resetting:
             state.deadline += _STARTING_SECONDS
-        try:
+        with suppress(OSError):  # of a process that ended, `recv` finds the connection closed
             protocol.send(state.connection, *message)
-        except OSError:
-            self._lost.append(self._crashed(worker, protocol.last_words(state.process)))
 
     def _poll(self, index: int, state: _Worker) -> Reply | None:
         """Take the reply of a worker, if it has sent one."""

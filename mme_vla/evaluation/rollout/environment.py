@@ -476,73 +476,79 @@ class Frames:
         }
 
 
-def base_env(
-    env: str,
-    robot: Embodiment,
-    render: bool = True,
-    reward: str = "none",
-    only_possible: bool = False,
-) -> Callable[..., Any]:
-    """What makes an episode of an environment for a robot, from `task`, `split`, `episode` and
-    `max_steps`: a `RoboMMEEnv`, of other environments an `EpisodeEnv`. Importable by worker
-    processes.
+@dataclass(frozen=True)
+class EpisodeFactory:
+    """Makes the environment of an episode, in the worker process that runs it: called with `task`,
+    `split` and `episode`.
 
-    env: its name; `reward` and `only_possible` have an effect on RoboMME alone.
-    """
-    environment(env).check_embodiment(robot)
-    if env != ROBOMME:
-        return partial(open_episode, env, action_space=robot.action.space, render=render)
-    assert robot.action.space is not None  # a robot of the benchmark has one
-    readings = dict.fromkeys(robot.readings, True)
-    return partial(
-        make_env,
-        action_space=robot.action.space,
-        render=render,
-        reward=reward,
-        include=Include(**readings, possible=only_possible),
-    )
-
-
-def make_rollout_env(
-    task: str,
-    split: str,
-    episode: int,
-    *,
-    base: Callable[..., Any] = make_env,
-    max_steps: int | Callable[[str], int] = DEFAULT_STEPS,
-    videos: tuple[str, str] | None = None,
-    run: str = "",
-    robot: Embodiment = ROBOMME_JOINT,
-    max_actions: int | None = None,
-    oracle: bool = False,
-) -> ChunkEnv:
-    """What every worker builds for an episode.
-
-    base: makes the environment itself from `task`, `split`, `episode` and `max_steps` (`base_env`).
-    max_steps: see `ChunkEnv`, or a function that gives it for a task.
+    robot: the policy's.
+    env: name of the environment; `reward` and `only_possible` have an effect on RoboMME alone.
+    base: makes the environment itself in place of `open`, from `task`, `split`, `episode` and
+        `max_steps`; importable by name.
+    options: further arguments of what makes it.
+    max_steps, max_actions, oracle: see `ChunkEnv`; or a function that gives the steps for a task.
     videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
     run: its name, in the videos.
-    robot, max_actions: the policy's.
-    oracle: see `ChunkEnv`.
+
+    Raises:
+        UserError: the environment does not take this robot.
     """
-    video = None
-    if videos is not None:
-        folder, save_on = videos
-        video = EpisodeVideo(
-            lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal),
-            save_on,
-            run,
+
+    robot: Embodiment = ROBOMME_JOINT
+    env: str = ROBOMME
+    base: Callable[..., Any] = make_env
+    options: Mapping[str, Any] = field(default_factory=dict)
+    render: bool = True
+    reward: str = "none"
+    only_possible: bool = False
+    max_steps: int | Callable[[str], int] = DEFAULT_STEPS
+    max_actions: int | None = None
+    oracle: bool = False
+    videos: tuple[str, str] | None = None
+    run: str = ""
+
+    def __post_init__(self) -> None:
+        if self.base is make_env:
+            environment(self.env).check_embodiment(self.robot)
+
+    def __call__(self, task: str, split: str, episode: int) -> ChunkEnv:
+        video = None
+        if self.videos is not None:
+            folder, save_on = self.videos
+            video = EpisodeVideo(
+                lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal),
+                save_on,
+                self.run,
+            )
+        stick = task in STICK_TASKS
+        if task in TASKS:  # once its module is imported
+            stick = stick or bool(getattr(TASKS[task], "stick", False))
+        limit = self.max_steps
+        if not isinstance(limit, int):
+            limit = limit(task)
+        return ChunkEnv(
+            partial(self.open, task, split, episode, limit),
+            stick=stick,
+            max_steps=limit,
+            video=video,
+            robot=self.robot,
+            max_actions=self.max_actions,
+            oracle=self.oracle,
         )
-    limit = max_steps if isinstance(max_steps, int) else max_steps(task)
-    stick = task in STICK_TASKS
-    if task in TASKS:  # once its module is imported
-        stick = stick or bool(getattr(TASKS[task], "stick", False))
-    return ChunkEnv(
-        lambda: base(task=task, split=split, episode=episode, max_steps=limit),
-        stick=stick,
-        max_steps=limit,
-        video=video,
-        robot=robot,
-        max_actions=max_actions,
-        oracle=oracle,
-    )
+
+    def open(self, task: str, split: str, episode: int, max_steps: int, **options: Any) -> Any:
+        """The environment itself, which takes single actions: a `RoboMMEEnv`, of other environments
+        an `EpisodeEnv`.
+
+        options: beside `options` of the factory, such as a twin's `row`.
+        """
+        arguments: dict[str, Any] = {**self.options, **options}
+        arguments |= {"task": task, "split": split, "episode": episode, "max_steps": max_steps}
+        if self.base is not make_env:
+            return self.base(**arguments)
+        arguments |= {"action_space": self.robot.action.space, "render": self.render}
+        if self.env != ROBOMME:
+            return open_episode(self.env, **arguments)
+        readings = dict.fromkeys(self.robot.readings, True)
+        include = Include(**readings, possible=self.only_possible)
+        return make_env(**arguments, reward=self.reward, include=include)

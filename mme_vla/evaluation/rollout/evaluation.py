@@ -1,11 +1,9 @@
 """A whole evaluation, from `mme_vla.evaluate` to the records in the run's folder."""
 
 import logging
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Unpack
 
@@ -15,6 +13,7 @@ from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, counted
+from mme_vla.evaluation.claims import ALONE, Claims, Shard, Waiting, check_sharing
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import (
     EpisodeRecord,
@@ -25,16 +24,14 @@ from mme_vla.evaluation.records import (
     merge,
     read_records,
 )
-from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
+from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
-from mme_vla.evaluation.rollout.runner import Rollout, Waiting, Workload
+from mme_vla.evaluation.rollout.runner import Rollout, Workload
 from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
-    RECORDS,
-    Claims,
     check_run_folder,
     claim_run,
     fingerprint,
@@ -50,19 +47,6 @@ from mme_vla.utils import remove_drafts, safe_name
 
 logger = logging.getLogger("mme_vla.evaluate")
 VIDEOS = "videos"
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One of several processes that share a run."""
-
-    index: int = 0
-    count: int = 1
-
-    @property
-    def file(self) -> str:
-        """Name of the file its records go to."""
-        return RECORDS if self.count == 1 else f"episodes-{self.index}of{self.count}.jsonl"
 
 
 class Evaluation(NamedTuple):
@@ -95,7 +79,7 @@ class RunOptions:
 
     subgoals: predicts the subgoal, where the policy reads one.
     shard: which of how many processes this is; each takes the next episode that is free when it has
-        room (`store.Claims`).
+        room (`claims.Claims`).
     source: where the weights are from; part of what makes a run the same.
     base: makes an environment with the benchmark's interface; importable by name.
     notes: kept in `run.json` and never compared.
@@ -106,7 +90,7 @@ class RunOptions:
     """
 
     subgoals: SubgoalPredictor | None = None
-    shard: Shard = Shard()
+    shard: Shard = ALONE
     source: str | None = None
     base: Callable[..., Any] = make_env
     notes: Mapping[str, Any] | None = None
@@ -193,26 +177,6 @@ def choose_episodes(
         Job(spec.task, spec.split, spec.episode)
         for spec in choose_specs(tasks, episodes, split, env)
     ]
-
-
-def choose_shard(text: str | None, variables: Mapping[str, str] | None = None) -> Shard:
-    """Read `0/4` (the first of four), or the rank of this process under torchrun.
-
-    text: wins over them.
-    variables: of the environment; None: the process's own.
-    """
-    if variables is None:
-        variables = os.environ
-    if text is None:
-        if "RANK" not in variables or "WORLD_SIZE" not in variables:
-            return Shard()
-        text = f"{variables['RANK']}/{variables['WORLD_SIZE']}"
-    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
-    if match is None or int(match[1]) >= int(match[2]):
-        raise UserError(
-            f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4."
-        )
-    return Shard(int(match[1]), int(match[2]))
 
 
 def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
@@ -380,6 +344,7 @@ class EvaluationRun:
         content = claim_run(self.folder, decisive, options.notes)
         workload = Workload()
         with RecordLog(self.folder / options.shard.file) as log:
+            check_sharing(self.folder, log.path.name)
             remove_drafts(self.folder / VIDEOS)  # videos of workers that were killed
             done = self._records()
             finished_keys = finished(done)
@@ -389,24 +354,18 @@ class EvaluationRun:
             workers = self.settings.worker_count(-(-len(missing) // options.shard.count))
             workers = min(workers, self.policy.info.max_running or workers)
 
-            completed = [record for record in done if record.outcome != "error"]
-            name = options.name or self.facts.label
-            with RolloutProgress(
-                len(self.jobs), completed, options.show_progress, name
-            ) as progress:
-                if completed:
-                    progress.say(
-                        f"{self.folder} holds {len(completed)} of"
-                        f" {counted(len(self.jobs), 'episode')}: continuing with the others"
-                    )
+            forecast = None
+            if options.show_forecast:
                 forecast = durations.forecast(missing, workers, options.shard.count)
-                if forecast and options.show_forecast:
-                    progress.say(str(forecast))
+            before = [record for record in done if record.outcome != "error"]
+            name = options.name or self.facts.label
+            with RolloutProgress(len(self.jobs), before, options.show_progress, name) as progress:
+                progress.announce(self.folder, forecast)
                 if missing:
                     workload = self._roll_out(missing, workers, content, log, progress)
         return Evaluation(self._records(options.shard), workload, self.folder)
 
-    def _records(self, shard: Shard = Shard()) -> list[EpisodeRecord]:
+    def _records(self, shard: Shard = ALONE) -> list[EpisodeRecord]:
         """The folder's records of these episodes; of one of several shards, only its own file's."""
         keys = {(job.task, job.episode) for job in self.jobs}
         files = sorted(self.folder.glob("episodes*.jsonl"))
@@ -456,26 +415,19 @@ class EvaluationRun:
 
     def _environments(self, workers: int) -> VecEnv:
         settings = self.settings
-        info = self.policy.info
-        base = self.options.base
-        if base is make_env:
-            base = base_env(
-                settings.env,
-                self.policy.embodiment,
-                settings.render,
-                only_possible=settings.only_possible,
-            )
         videos = None
         if settings.video != "none":
             videos = (str(self.folder / VIDEOS), settings.video)
-        make = partial(
-            make_rollout_env,
-            base=base,
+        make = EpisodeFactory(
+            self.policy.embodiment,
+            settings.env,
+            self.options.base,
+            render=settings.render,
+            only_possible=settings.only_possible,
             max_steps=settings.limit_of,
+            max_actions=settings.max_actions or self.policy.info.max_actions,
             videos=videos,
             run=self.facts.label,
-            robot=self.policy.embodiment,
-            max_actions=settings.max_actions or info.max_actions,
         )
         # It begins without jobs: `Waiting` hands them out.
         return VecEnv([], workers, make, settings.timeout_s)

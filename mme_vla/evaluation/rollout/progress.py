@@ -19,7 +19,7 @@ from mme_vla.evaluation.store import find_records
 class RolloutProgress(Bar):
     """A line an episode, and the success so far: beside a bar on a terminal, else in the line.
 
-    total: episodes of this process.
+    total: episodes of the run, whichever process runs them.
     before: records of those that an earlier run has finished.
     name: of the run, such as `nano · drop:all`: every line and the bar begin with it.
     """
@@ -51,6 +51,16 @@ class RolloutProgress(Bar):
         if errors:
             text += f" · {errors} errors"
         return text
+
+    def announce(self, folder: Path, forecast: "Forecast | None") -> None:
+        """Say what the run's folder holds, and how long the rest takes."""
+        if self.done:
+            self.say(
+                f"{folder} holds {self.done} of {counted(self.total, 'episode')}: continuing with"
+                " the others"
+            )
+        if forecast is not None:
+            self.say(str(forecast))
 
     def episode(self, record: EpisodeRecord, again: bool = False) -> None:
         """One episode ended; `again` if it will be tried once more, and does not count yet."""

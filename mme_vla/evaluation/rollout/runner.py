@@ -6,7 +6,7 @@ Each worker executes its chunk at its own pace, and joins the policy's next batc
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -16,52 +16,18 @@ import numpy as np
 from mme_vla.envs.base import environment
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import SceneError, UserError, place_of, text_of
+from mme_vla.errors import SceneError, UserError
+from mme_vla.evaluation.claims import Waiting
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import ChunkCommand
+from mme_vla.evaluation.rollout.failures import FailureStreaks
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
-from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy, frames_a_piece
-from mme_vla.policy.episode import Failure
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.subgoal import SubgoalPredictor
-
-
-class Waiting:
-    """Episodes in the order they begin.
-
-    jobs: all that are left.
-    claims: where other processes run the same ones; each then begins what it could claim.
-    """
-
-    def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
-        self._jobs = list(jobs)
-        self._claims = claims
-        self._again: list[Job] = []
-
-    def take(self) -> Job | None:
-        """The next episode to begin, if there is one; those tried again come last."""
-        job = None
-        if self._claims is not None:
-            job = self._claims.take(self._jobs)
-            if job is not None:
-                self._jobs.remove(job)
-        elif self._jobs:
-            job = self._jobs.pop(0)
-        if job is None and self._again:
-            job = self._again.pop(0)
-        return job
-
-    def put_back(self, job: Job) -> None:
-        """Have an episode run once more, by this process."""
-        self._again.append(job)
-
-
-GIVE_UP_AFTER = 8  # episodes in a row that did not even begin
-SAME_ERRORS = 2  # equal errors of an environment's code, in a row, that stop a run
 
 
 class Environments(Protocol):
@@ -127,7 +93,7 @@ class Rollout:
 
         Args:
             policy: in eval mode, on its device.
-            envs: environments that take chunks (`make_rollout_env`).
+            envs: environments that take chunks (of an `EpisodeFactory`).
             facts: what the records say of the policy.
             record: called with every record, as soon as there is one.
             subgoals: predicts the subgoal; None leaves it out of the prompt.
@@ -147,10 +113,7 @@ class Rollout:
         self._waiting = Waiting()
         self._running: dict[int, RunningEpisode] = {}  # by worker
         self._tries: Counter[Job] = Counter()
-        self._stillborn = 0  # episodes in a row whose environments did not begin
-        self._inactive = 0  # episodes in a row in which the policy chose no chunk
-        self._last_error = ""  # of an environment's code
-        self._same_errors = 0  # episodes in a row that it ended
+        self._failures = FailureStreaks()
         self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(
             settings.max_batch
         )
@@ -228,7 +191,7 @@ class Rollout:
             self._take_last(running, reply)
             return
         if reply.is_reset:
-            self._stillborn = 0
+            self._failures.note_start()
             if self._rerenders_video(running, reply):
                 return
             running.begin(reply.observation)
@@ -247,38 +210,10 @@ class Rollout:
             message = reply.info["error_message"]
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
-        # A scene in which an object finds no place finds none again, and says nothing of the
-        # simulator.
+        self._failures.note_end(reply, message, is_repeated=self._tries[running.job] > 1)
+        # A scene in which an object finds no place finds none again.
         is_unbuildable = isinstance(reply.error, SceneError)
-        if not running.chunks and not is_unbuildable:
-            self._stillborn += 1
-        self._check_same_error(running, reply)
-        if self._stillborn >= GIVE_UP_AFTER:
-            raise UserError(
-                f"{self._stillborn} environments in a row could not be started, so the run stops;"
-                f" the last one: {message}"
-            )
         self._finish(running, status, message, retry=not is_unbuildable)
-
-    def _check_same_error(self, running: RunningEpisode, reply: Reply) -> None:
-        """Stop if the environment's own code failed twice in the same way: it will again."""
-        if reply.error is None:
-            self._same_errors = 0
-            return
-        # In episodes that are tried again, all that failed for rare reasons meet.
-        if place_of(reply.error) is None or self._tries[running.job] > 1:
-            return
-        text = text_of(reply.error)
-        if text != self._last_error:
-            self._last_error = text
-            self._same_errors = 0
-        self._same_errors += 1
-        if self._same_errors >= SAME_ERRORS:
-            raise UserError(
-                f"{self._same_errors} episodes in a row ended in the same error of the"
-                f" environment's code, so the run stops: {text} Mend it, and repeat the command:"
-                " finished episodes are kept."
-            )
 
     def _rerenders_video(self, running: RunningEpisode, reply: Reply) -> bool:
         """Reset the episode once more if video frames that its memory reads were not rendered."""
@@ -337,10 +272,13 @@ class Rollout:
         execute = self.settings.execute or self.policy.embodiment.action.execute
         for running, chunk in zip(batch, chunks, strict=True):
             running.add_policy_seconds(share)
-            if (failure := running.episode.failure) is not None:
-                self._give_up(running, failure)
+            failure = running.episode.failure
+            if failure is not None:  # the policy cannot act in it any more
+                if not running.chunks:
+                    self._failures.note_no_chunk(failure.reason)
+                self._finish(running, "error", failure.reason, retry=failure.again)
                 continue
-            self._inactive = 0
+            self._failures.note_chunk()
             actions = chunk[:execute]
             if not np.isfinite(actions).all():
                 self._finish(
@@ -352,17 +290,6 @@ class Rollout:
             command = ChunkCommand(actions, subgoal=running.episode.subgoal, images=images)
             self.envs.send(running.worker, command)
             self._scheduler.later[running] = None
-
-    def _give_up(self, running: RunningEpisode, failure: Failure) -> None:
-        """End an episode in which the policy cannot act any more."""
-        if not running.chunks:
-            self._inactive += 1
-        if self._inactive >= GIVE_UP_AFTER:
-            raise UserError(
-                f"The policy chose no chunk in {self._inactive} episodes in a row, so the run"
-                f" stops; the last one: {failure.reason}"
-            )
-        self._finish(running, "error", failure.reason, retry=failure.again)
 
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True

@@ -130,27 +130,29 @@ class RunningEpisode:
     def resume(self, frames: Observation) -> None:
         """Take the frames that the executed actions led to."""
         self._count_executed()
+        if self.events.holding is not None:
+            self._resume_held(frames, self.events.holding.observed)
+            return
+        n_frames = len(frames["state"])
+        self._note_observed(n_frames, np.arange(n_frames))
+        if self._robot.action.frames is not None:
+            n_frames = self.report.executed
+        self._queue(frames, np.zeros(n_frames, bool), self._sent[: self.report.executed])
+
+    def _resume_held(self, frames: Observation, n_observed: int) -> None:
+        """Take the newest frames of the time for which an event held the robot."""
         length = len(frames["state"])
-        has_one_a_frame = self._robot.action.frames is not None
-        leading: np.ndarray | None
-        if self.events.holding is None:
-            self._note_observed(length, np.arange(length))
-            leading = self._sent[: self.report.executed]
-            n_frames = self.report.executed if has_one_a_frame else length
-        else:
-            # An event held the robot: the newest frames of that time are observed.
-            self.events.hold_steps += length
-            n_frames = min(self.events.holding.observed, length)
-            observed = np.arange(length - n_frames, length)
-            self._note_observed(length, observed)
-            frames = select_frames(frames, observed)
-            leading = self._sent[:0]
-            if has_one_a_frame:
-                leading = None  # before the first action
-                if self.report.held is not None:
-                    target = np.asarray(self.report.held, np.float32)
-                    leading = np.repeat(target[None], n_frames, axis=0)
-        self._queue(frames, np.zeros(n_frames, bool), leading)
+        self.events.hold_steps += length
+        n_frames = min(n_observed, length)
+        observed = np.arange(length - n_frames, length)
+        self._note_observed(length, observed)
+        leading: np.ndarray | None = self._sent[:0]
+        if self._robot.action.frames is not None:
+            leading = None  # before the first action
+            if self.report.held is not None:
+                target = np.asarray(self.report.held, np.float32)
+                leading = np.repeat(target[None], n_frames, axis=0)
+        self._queue(select_frames(frames, observed), np.zeros(n_frames, bool), leading)
 
     def _note_observed(self, length: int, observed: np.ndarray) -> None:
         """Note which of the next `length` frames the policy observes, int64 [n]."""
@@ -197,18 +199,24 @@ class RunningEpisode:
             self.episode.observe(views, states, demo, actions)
         else:
             self.episode.observe(views, states, demo, actions, rendered=rendered)
-
-        # A subgoal predictor has seen the video when the episode began.
-        if self.watched is not None and not demo[-1:].any():
-            camera = self._robot.memory_camera
-            displayed = views[camera][~demo[rendered[camera]]]
-            passed = int((~demo).sum()) - len(displayed)
-            if passed:
-                self.watched.skip(passed)
-            if len(displayed):
-                self.watched.observe(displayed, self.report.info)
+        self._show_predictor(views[self._robot.memory_camera], rendered, demo)
         self._at = part.stop
         self.add_policy_seconds(time.perf_counter() - begun)
+
+    def _show_predictor(
+        self, images: np.ndarray, rendered: dict[str, np.ndarray], demo: np.ndarray
+    ) -> None:
+        """Have a subgoal predictor see frames of the execution: it has seen the video when the
+        episode began.
+        """
+        if self.watched is None or demo[-1:].any():
+            return
+        displayed = images[~demo[rendered[self._robot.memory_camera]]]
+        passed = int((~demo).sum()) - len(displayed)
+        if passed:
+            self.watched.skip(passed)
+        if len(displayed):
+            self.watched.observe(displayed, self.report.info)
 
     def _views(self, part: slice) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Images of every camera, and their places in this part of the frames."""

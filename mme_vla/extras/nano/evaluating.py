@@ -22,12 +22,12 @@ from mme_vla.envs.robomme.recording.frames import motions_of
 from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError, require
+from mme_vla.evaluation.claims import choose_shard
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RecordLog, read_records
 from mme_vla.evaluation.rollout.evaluation import (
     VIDEOS,
     EvaluationRun,
     RunOptions,
-    choose_shard,
     facts_of,
     predictor_of,
 )

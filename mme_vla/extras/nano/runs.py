@@ -21,8 +21,8 @@ from mme_vla.envs.robomme.recording.frames import DECISIONS, FrameChoice
 from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, brief, counted, require
+from mme_vla.evaluation.claims import choose_shard
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import choose_shard
 from mme_vla.extras.nano.board import MATCHED
 from mme_vla.extras.nano.demonstrations import Scene, demonstrated
 from mme_vla.extras.nano.evaluating import (

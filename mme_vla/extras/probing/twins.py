@@ -33,12 +33,7 @@ from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, mean_interval
 from mme_vla.evaluation.results.tables import Table, to_markdown
-from mme_vla.evaluation.rollout.environment import (
-    ChunkCommand,
-    ChunkEnv,
-    base_env,
-    make_rollout_env,
-)
+from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv, EpisodeFactory
 from mme_vla.evaluation.rollout.evaluation import RunOptions, run_settings
 from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -172,29 +167,29 @@ class TwinScenes:
     Args:
         policies: arm → policy; the same robot. The first one's reads decide what is rendered.
         settings: noise, split, environment, actions of a chunk that are executed.
-        base: makes an environment from `task`, `split`, `episode`, `max_steps` and `row`; None for
-            that of the settings.
+        base: makes an environment from `task`, `split`, `episode`, `max_steps` and `row`; by
+            default that of the settings.
     """
 
     def __init__(
         self,
         policies: Mapping[str, Policy],
         settings: RolloutSettings,
-        base: Callable[..., Any] | None = None,
+        base: Callable[..., Any] = make_env,
     ) -> None:
         self._policies = policies
         self._settings = settings
         policy = next(iter(policies.values()))
         self._robot = policy.embodiment
         self._plan = RenderPlan(policy, None, settings)
-        if base is None:
-            make = partial(
-                base_env, settings.env, self._robot, only_possible=settings.only_possible
-            )
-            self._with_images = make(render=settings.render)
-            self._without_images = make(render=False)
-        else:
-            self._with_images = self._without_images = base
+        self._with_images = EpisodeFactory(
+            self._robot,
+            settings.env,
+            base,
+            render=settings.render,
+            only_possible=settings.only_possible,
+        )
+        self._without_images = replace(self._with_images, render=False)
 
     def run(self, job: Job) -> TwinLine:
         """Both scenes of an episode, under every arm."""
@@ -287,21 +282,12 @@ class TwinScenes:
         finally:
             env.close()
 
-    def _open(self, base: Callable[..., Any], spec: EpisodeSpec) -> tuple[Any, ChunkEnv]:
+    def _open(self, factory: EpisodeFactory, spec: EpisodeSpec) -> tuple[Any, ChunkEnv]:
         """The environment of a scene, and the same one as it takes chunks."""
         limit = self._settings.limit_of(spec.task)
-        made = base(
-            task=spec.task, split=spec.split, episode=spec.episode, max_steps=limit, row=spec.row
-        )
-        env = make_rollout_env(
-            spec.task,
-            spec.split,
-            spec.episode,
-            base=lambda **_: made,
-            max_steps=limit,
-            robot=self._robot,
-        )
-        return made, env
+        made = factory.open(spec.task, spec.split, spec.episode, limit, row=spec.row)
+        factory = replace(factory, base=lambda **_: made, max_steps=limit)
+        return made, factory(spec.task, spec.split, spec.episode)
 
 
 def _read(running: RunningEpisode) -> None:
@@ -423,10 +409,7 @@ def run_twins(
     local = list(jobs)[shard.index :: shard.count]
     known = {(line.task, line.episode) for line in read_twins(folder)}
     missing = [job for job in local if (job.task, job.episode) not in known]
-    base = None
-    if options.base is not make_env:
-        base = options.base
-    scenes = TwinScenes(policies, settings, base)
+    scenes = TwinScenes(policies, settings, options.base)
     bar: AbstractContextManager[Callable[[int], object]] = nullcontext(lambda _: None)
     if options.show_progress:
         bar = progress("twins", len(local), len(local) - len(missing), unit="pairs")

@@ -12,7 +12,7 @@ from mme_vla.evaluation.rollout.environment import ChunkEnv
 class LocalEnvs:
     """One environment in this process, in place of a `VecEnv`.
 
-    make: makes it from `task`, `split` and `episode` (`make_rollout_env`).
+    make: makes it from `task`, `split` and `episode` (an `EpisodeFactory`).
     """
 
     workers = 1

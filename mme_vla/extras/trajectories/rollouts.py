@@ -5,7 +5,6 @@ came of it.
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,11 @@ from torch.nn import functional
 
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.config.sections import read_section
+from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
 from mme_vla.evaluation.records import RunKey
-from mme_vla.evaluation.rollout.environment import Report, base_env, make_rollout_env
+from mme_vla.evaluation.rollout.environment import EpisodeFactory, Report
 from mme_vla.evaluation.rollout.runner import Ending, Rollout
 from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -156,16 +156,16 @@ def rollouts(
         not oracle or policy.embodiment.action.choice,
         "The oracle chooses among options: use embodiment=robomme_choice, or keep no oracle.",
     )
-    if callable(env):
-        base = env
-    else:
+    if not callable(env):
         check_known("reward", reward, REWARDS)
-        base = base_env(env, policy.embodiment, run_settings.render, reward)
-    make = partial(
-        make_rollout_env,
-        base=partial(base, **options),
+    make = EpisodeFactory(
+        policy.embodiment,
+        run_settings.env,
+        env if callable(env) else make_env,
+        options,
+        render=run_settings.render,
+        reward=reward,
         max_steps=run_settings.limit_of,
-        robot=policy.embodiment,
         oracle=oracle,
     )
     envs: VecEnv | LocalEnvs = LocalEnvs(make)

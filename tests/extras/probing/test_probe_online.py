@@ -11,7 +11,8 @@ from helpers.probe_fakes import JOBS, actions, made_up, reader
 from helpers.rollout_fakes import FACTS, quick_policy, use_inline_envs
 from helpers.scripted_env import make_moving_env
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout.evaluation import RunOptions, Shard
+from mme_vla.evaluation.claims import Shard
+from mme_vla.evaluation.rollout.evaluation import RunOptions
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import LINES

@@ -29,12 +29,8 @@ def probe(cfg: DictConfig) -> None:
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_numbers, named_tasks
-    from mme_vla.evaluation.rollout.evaluation import (
-        RunOptions,
-        choose_episodes,
-        choose_shard,
-        facts_of,
-    )
+    from mme_vla.evaluation.claims import choose_shard
+    from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, facts_of
     from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.extras.probing.card import PAGE, card_text, run_card
