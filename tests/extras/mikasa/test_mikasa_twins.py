@@ -17,8 +17,18 @@ from mme_vla.extras.probing.twins import run_twins
 from mme_vla.testing.small import small_policy
 
 
-@pytest.mark.usefixtures("simulator")
-def test_only_what_knows_the_fact_is_right_in_both_scenes(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("lamp_model", "cup_model")
+@pytest.mark.parametrize(
+    "task",
+    [
+        "RememberColor3",
+        pytest.param("ShellGameTouch", marks=pytest.mark.slow),
+        pytest.param("ShellGamePush", marks=pytest.mark.slow),
+        pytest.param("ShellGameShuffleTouch", marks=pytest.mark.slow),
+        pytest.param("ShellGameShuffleColorLampTouch", marks=pytest.mark.slow),
+    ],
+)
+def test_only_what_knows_the_fact_is_right_in_both_scenes(task: str, tmp_path: Path) -> None:
     made: list[Any] = []
 
     def base(**scene: Any) -> Any:
@@ -32,18 +42,18 @@ def test_only_what_knows_the_fact_is_right_in_both_scenes(tmp_path: Path) -> Non
             candidates, place = made[-1].candidates, made[-1].tool
             goal = candidates.places[candidates.correct[0] if number is None else number]
             gap = np.asarray(goal) - place
-            row = np.zeros(7, np.float32)  # of four equal steps, of 0.038 m at most
-            row[:2] = gap / max(float(np.linalg.norm(gap)), 4 * 0.038)
-            return np.tile(row, (4, 1))
+            row = np.zeros(7, np.float32)  # of eight equal steps, of 0.038 m at most
+            row[:2] = gap / max(float(np.linalg.norm(gap)), 8 * 0.038)
+            return np.tile(row, (8, 1))
 
         return rule
 
     options = RunOptions(show_progress=False, base=base)
-    settings = RolloutSettings(env="mikasa", seed=7)
+    settings = RolloutSettings(env="mikasa", seed=7, execute=8)
     facts = RunKey("planted", "none", 7)
     for name, rule, expected in (("knows", towards(None), 1), ("always the first", towards(0), 0)):
         policy = Planted(small_policy("pi05", env="mikasa"), rule)
-        jobs = [Job("RememberColor3", "test", episode) for episode in range(2)]
+        jobs = [Job(task, "test", episode) for episode in range(2)]
         twins = run_twins(policy, jobs, tmp_path / name, facts, settings, options)
         accuracy = twins.total[UNPROBED.name]
         assert (accuracy.pairs, accuracy.accuracy) == (2, expected), twins.notes
