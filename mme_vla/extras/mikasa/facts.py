@@ -366,31 +366,24 @@ class Covered(SceneFacts):
         self._cups = (scene.mug_left, scene.mug_center, scene.mug_right)
         if hasattr(scene, "red_ball"):
             self._right = scene.cup_with_ball_number
-            self._balls = {"ball": (int(self._right[0]), scene.red_ball)}
         else:
             self._right = scene.target_color
-            balls = (scene.ball_red, scene.ball_green, scene.ball_blue)
-            self._balls = {f"{_LIGHTS[i]} ball": (i, ball) for i, ball in enumerate(balls)}
-
-    def _open_balls(self) -> Mapping[str, int]:
-        """Balls that can be seen, each with the number of its cup.
-
-        The benchmark's cups fall while they are hidden, so that they can begin too deep to cover.
-        """
-        found = {}
-        for name, (number, ball) in self._balls.items():
-            cup = self._cups[number]
-            top = place_of(cup)[2] + float(self._scene.object_zs[number])
-            is_covered = _in_view(cup) and top > 2 * self._scene.BALL_RADIUS
-            if _in_view(ball) and not is_covered:
-                found[name] = number
-        return found
 
     def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         scene = self._scene
+        if hasattr(scene, "red_ball"):
+            balls = {"ball": (int(self._right[0]), scene.red_ball)}
+        else:
+            actors = (scene.ball_red, scene.ball_green, scene.ball_blue)
+            balls = {f"{_LIGHTS[i]} ball": (i, ball) for i, ball in enumerate(actors)}
         visible = {}
-        for name, number in self._open_balls().items():
-            visible[name] = VisibleFact(f"{_CUPS[number]} cup", {_CUPS[number]})
+        for name, (number, ball) in balls.items():
+            # Cups fall while they are hidden, so that they can begin too deep to cover a ball.
+            cup = self._cups[number]
+            top = place_of(cup)[2] + float(scene.object_zs[number])
+            is_covered = _in_view(cup) and top > 2 * scene.BALL_RADIUS
+            if _in_view(ball) and not is_covered:
+                visible[name] = VisibleFact(f"{_CUPS[number]} cup", {_CUPS[number]})
         decides = time >= self._cue_end and not visible and not self._is_decided
         self._is_decided |= decides
         since = time - int(scene.cue_steps_per_env[0])
@@ -423,7 +416,6 @@ class Covered(SceneFacts):
             scene.oracle_info[:] = after[right]
         else:
             self._right[:] = (right + 1) % 3
-            self._balls = {"ball": (int(self._right[0]), scene.red_ball)}
             moved = (int(self._right[0]) - right) * scene.MIN_DIST
             for name in ("red_ball", "goal_site"):
                 if hasattr(scene, name):
