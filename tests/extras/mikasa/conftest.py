@@ -23,12 +23,12 @@ def simulator() -> Iterator[None]:
 
 @pytest.fixture
 def lamp_model(simulator: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A white ball in place of the model of the lamps."""
+    """A white ball of 0.05 m, which hides little, in place of the model of the lamps."""
     import trimesh
     from mikasa_robo_suite.vla.utils import shapes
     from trimesh.visual.material import PBRMaterial
 
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
     ball.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(baseColorFactor=[255] * 4))
     model = tmp_path / "objects" / assets.bulb_file().name
     model.parent.mkdir()
