@@ -15,6 +15,7 @@ from mme_vla.errors import require
 REACH = 0.1  # metres, and radians, that an action of 1 moves the hand
 OPEN, CLOSED = 1.0, -1.0
 _STEP_SECONDS = 0.05  # of one control step
+_SETTLE_STEPS = 5  # in which cups come to lie over the ball
 
 Actions = Iterator[np.ndarray]
 
@@ -23,16 +24,18 @@ def demonstrate(env: Any) -> Actions:
     """Solve the episode of an environment, just reset; the last action repeats until it is over.
 
     Raises:
-        UserError: there is no script for its task.
+        UserError: there is no script for its task. The hand has waited until the answer can be
+            given, which is all that twins need.
     """
     name = type(env.scene).__name__
     scripts = [script for beginning, script in _SCRIPTS.items() if name.startswith(beginning)]
-    require(scripts, f"There is no script that demonstrates {name}.")
-    script = scripts[0]
     hand = Hand(env.scene)
     while env.time < env.cue_end:
         yield hand.action(gripper=OPEN)
-    yield from script(hand)
+    if not scripts:
+        yield from hand.hold(_SETTLE_STEPS, OPEN)
+    require(scripts, f"There is no script that demonstrates {name}.")
+    yield from scripts[0](hand)
     while True:
         yield hand.action(gripper=hand.gripper)
 

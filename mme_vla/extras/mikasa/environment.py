@@ -57,11 +57,13 @@ class MikasaScene(gymnasium.Env[Any, Any]):
 
         self._rendered = render
         self._backend = render_backend() if render else "none"
+        # Images are taken on demand. What ShellGamePush's reward reads is computed with its state.
+        observed = "state" if task == "ShellGamePush" else "none"
         with self._building() as cameras:
             self._env = gymnasium.make(
                 f"{task}-VLA-v0",
                 num_envs=1,
-                obs_mode="none",  # images are taken on demand
+                obs_mode=observed,
                 control_mode="pd_ee_delta_pose",
                 reward_mode="normalized_dense",
                 sim_backend="physx_cpu",

@@ -1,7 +1,5 @@
 """What the tasks of MIKASA-Robo-VLA show and need later, from the simulator's state: one class for
 each kind of scene, its facts, the fact that a twin flips, and what can be chosen.
-
-Tasks whose models the package lacks have none: `SceneFacts`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,6 +27,14 @@ _NEAR = 0.1  # metres from the hand to a thing that it touches, or has just touc
 _MOVED = 0.01  # metres, and radians: a thing that was moved by less lies as it lay
 _COLUMN = 0.1  # metres between the three columns in which TakeItBack's cube begins
 _COLUMNS = ("right", "middle", "left")
+_LIGHTS = ("red", "green", "blue")  # of lamps and balls, by their number
+_SHAPES = ("circle", "square", "triangle")  # that are traced, by their number
+_CUPS = ("left", "center", "right")
+
+
+def _in_view(thing: Any) -> bool:
+    """Whether a thing is on the table: what a scene hides, it puts 1,000 metres up."""
+    return bool(place_of(thing)[2] < 1)
 
 
 class SceneFacts:
@@ -345,6 +351,199 @@ class Rolling(SceneFacts):
         return {"velocity": VisibleFact(f"{speed:.2f} m/s")}, False
 
 
+class Covered(SceneFacts):
+    """ShellGame: which cup each ball is under, and each swap of two cups. A swap replaces what was
+    known of its cups.
+
+    In twins another cup hides the ball. Of cups that are shuffled, the last swap is another one.
+    """
+
+    has_twin = True
+    _is_decided = False
+
+    def __init__(self, scene: Any, cue_end: int, by_choice: bool = False) -> None:
+        super().__init__(scene, cue_end, by_choice)
+        self._cups = (scene.mug_left, scene.mug_center, scene.mug_right)
+        if hasattr(scene, "red_ball"):
+            self._right = scene.cup_with_ball_number
+        else:
+            self._right = scene.target_color
+
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        scene = self._scene
+        if hasattr(scene, "red_ball"):
+            balls = {"ball": (int(self._right[0]), scene.red_ball)}
+        else:
+            actors = (scene.ball_red, scene.ball_green, scene.ball_blue)
+            balls = {f"{_LIGHTS[i]} ball": (i, ball) for i, ball in enumerate(actors)}
+        visible = {}
+        for name, (number, ball) in balls.items():
+            # Cups fall while they are hidden, so that they can begin too deep to cover a ball.
+            cup = self._cups[number]
+            top = place_of(cup)[2] + float(scene.object_zs[number])
+            is_covered = _in_view(cup) and top > 2 * scene.BALL_RADIUS
+            if _in_view(ball) and not is_covered:
+                visible[name] = VisibleFact(f"{_CUPS[number]} cup", {_CUPS[number]})
+        decides = time >= self._cue_end and not visible and not self._is_decided
+        self._is_decided |= decides
+        since = time - int(scene.cue_steps_per_env[0])
+        if hasattr(scene, "swap_pairs") and since >= 0:
+            swap, moved = divmod(since, int(scene.steps_per_swap_per_env[0]))
+            if moved and swap < int(scene.num_swaps_per_env[0]):
+                pair = scene.swap_pairs[0, swap].tolist()
+                before = scene.slot_of_mug[0, swap].tolist()
+                value = " and ".join(_CUPS[place] for place in pair)
+                cups = {_CUPS[cup] for cup in range(3) if before[cup] in pair}
+                visible[f"swap {swap + 1}"] = VisibleFact(value, cups, replaces=True)
+        return visible, decides
+
+    def flip(self) -> None:
+        scene = self._scene
+        right = int(self._right[0])
+        if hasattr(scene, "swap_pairs"):
+            last = int(scene.num_swaps_per_env[0]) - 1
+            before = scene.slot_of_mug[0, last].clone()
+            pair = scene.swap_pairs[0, last]
+            place = int(before[right])
+            for other in range(3):
+                if other != place and {place, other} != set(pair.tolist()):
+                    new = (place, other)
+            pair[0], pair[1] = min(new), max(new)
+            after = before.clone()
+            after[before == new[0]] = new[1]
+            after[before == new[1]] = new[0]
+            scene.slot_of_mug[0, last + 1 :] = after
+            scene.oracle_info[:] = after[right]
+        else:
+            self._right[:] = (right + 1) % 3
+            moved = (int(self._right[0]) - right) * scene.MIN_DIST
+            for name in ("red_ball", "goal_site"):
+                if hasattr(scene, name):
+                    thing = getattr(scene, name)
+                    pose = thing.pose.raw_pose.clone()
+                    pose[:, 1] += moved
+                    thing.pose = pose
+
+    def candidates(self, time: int) -> Candidates | None:
+        if not self._is_decided:
+            return None
+        places = [place_of(cup)[:2].tolist() for cup in self._cups]
+        right = places[int(self._right[0])]
+        places.sort(key=lambda place: place[1])  # an order that tells nothing about swaps
+        return Candidates(places, [places.index(right)])
+
+
+class Ordered(Covered):
+    """ShellGameColorLampTouch: its balls always lie in the same order, so that it has no twin."""
+
+    has_twin = False
+
+
+class Blinks(SceneFacts):
+    """BlinkCount: each blink, and each press of the button, which leave no trace. They are counts,
+    and a higher one replaces the last.
+    """
+
+    _presses = 0
+
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        scene = self._scene
+        visible = {}
+        if _in_view(scene.lamp_bulb_on):
+            starts = scene.blink_start_steps[0, : int(scene.target_blinks[0])]
+            blinks = int((starts <= time).sum())
+            visible[f"blink {blinks}"] = VisibleFact(str(blinks), {"blinks"}, replaces=True)
+        if bool(scene.pending_press[0]):
+            begun = int(scene.raw_press_count[0])
+            visible[f"press {begun}"] = VisibleFact(str(begun), {"presses"}, replaces=True)
+        presses = int(scene.press_count[0])
+        decides = time == self._cue_end or presses > self._presses
+        self._presses = presses
+        return visible, decides
+
+
+class Traced(SceneFacts):
+    """TraceShape: each shape that the red cube traces. TraceShapeSeq: each that the green cube has
+    traced as well. It leaves no trace, and replaces the last one as the place in the order.
+    """
+
+    _traces = 0
+
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        scene = self._scene
+        paths = scene.waypoints[0].reshape(-1, scene.NUM_WAYPOINTS, 2)
+        is_sequence = hasattr(scene, "shape_sequence")
+        shapes = scene.shape_sequence[0] if is_sequence else scene.shape_type
+        values = []
+        for shape, path in zip(shapes.tolist(), paths.cpu().numpy(), strict=True):
+            radius = np.linalg.norm(path[0] - path.mean(axis=0))
+            values.append(f"{_SHAPES[shape]} of {radius:.2f} m")
+
+        visible = {}
+        since = time - int(scene.pre_demo_steps_per_env[0])
+        if since >= 0 and time < self._cue_end:
+            number = since // (scene.NUM_WAYPOINTS * scene.STEPS_PER_WAYPOINT)
+            visible[f"shape {number + 1}"] = VisibleFact(values[number])
+        decides = time == self._cue_end
+        if is_sequence:
+            traces = int(scene.shape_closed[0].sum())
+            decides |= traces > self._traces
+            self._traces = traces
+            is_active = traces < int(scene.sequence_len[0])
+            if is_active and bool(scene.checkpoint_visited[0, traces].any()):
+                fact = VisibleFact(values[traces], {"traces"}, replaces=True)
+                visible[f"trace {traces + 1}"] = fact
+        return visible, decides
+
+
+class Timed(SceneFacts):
+    """TimedTransfer: when the lamp turned green. The cube is to be put down some steps later, which
+    the goal names.
+    """
+
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        visible = {}
+        if time == int(self._scene.signal_step[0]):
+            visible["signal"] = VisibleFact(f"step {time}")
+        return visible, time == int(self._scene.window_start[0])
+
+
+class Flashed(SceneFacts):
+    """GatherAndRecall: the colour in which the lamp flashes, needed once every cube has been on the
+    disc.
+    """
+
+    _is_gathered = False
+
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        visible = {}
+        for color, bulb in zip(_LIGHTS, self._scene.lamp_bulbs_on, strict=True):
+            if _in_view(bulb):
+                visible["flash"] = VisibleFact(color)
+        gathered = bool(self._scene.cubes_on_disc[0].all())
+        decides = gathered and not self._is_gathered
+        self._is_gathered = gathered
+        return visible, decides
+
+
+class Checked(SceneFacts):
+    """BatteriesChecker: each battery that was in the socket, and whether the lamp was lit. All look
+    the same when they are back, and the next one is chosen after each press of the button.
+    """
+
+    def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        scene = self._scene
+        battery = int(scene.active_battery_idx[0])
+        is_shown = bool(scene.new_insert_event[0]) or _in_view(scene.lamp_bulb_on)
+        is_shown |= int(scene.action_stage[0]) == scene.STAGE_RETURN
+        visible = {}
+        if battery >= 0 and is_shown:
+            result = "works" if bool(scene.working_mask[0, battery]) else "does not work"
+            number = int(scene.checked_count[0]) + 1
+            visible[f"check {number}"] = VisibleFact(f"battery {battery + 1} {result}")
+        return visible, bool(scene.new_confirm_event[0])
+
+
 _KINDS: Mapping[str, type[SceneFacts]] = {
     "Remember": Recall,
     "FindImposter": Recall,
@@ -354,8 +553,15 @@ _KINDS: Mapping[str, type[SceneFacts]] = {
     "TakeItBack": Origin,
     "Rotate": Turned,
     "Intercept": Rolling,
+    "ShellGameColorLamp": Ordered,
+    "ShellGame": Covered,
+    "BlinkCount": Blinks,
+    "TraceShape": Traced,
+    "TimedTransfer": Timed,
+    "GatherAndRecall": Flashed,
+    "BatteriesChecker": Checked,
 }
-"""Beginning of a task's name → what its scenes show."""
+"""Beginning of a task's name → what its scenes show; the longer ones first."""
 
 
 def facts_of_task(task: str) -> type[SceneFacts]:

@@ -1,5 +1,6 @@
 """Facts of MIKASA-Robo-VLA's scenes, and twins in which one of them is flipped."""
 
+from collections.abc import Iterable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,8 @@ import torch
 from mme_vla.envs.base import environment
 from mme_vla.envs.facts import FactLog
 from mme_vla.extras.mikasa.catalog import FAMILY_OF
-from mme_vla.extras.mikasa.facts import InOrder, Several, facts_of_task
+from mme_vla.extras.mikasa.demonstrators import CLOSED, Hand, place_of
+from mme_vla.extras.mikasa.facts import InOrder, SceneFacts, Several, facts_of_task
 from mme_vla.extras.probing.evidence import record_evidence
 from mme_vla.extras.probing.writing import operations_of
 
@@ -104,10 +106,19 @@ def test_twins_of_a_chain_exchange_the_first_two_and_decide_at_once() -> None:
 def test_tasks_whose_answer_is_an_object_have_twins() -> None:
     with_twin = [task for task in FAMILY_OF if facts_of_task(task).has_twin]
     kinds = {FAMILY_OF[task].memory for task in with_twin}
-    assert len(with_twin) == 45 and kinds == {"Object", "Negative", "Capacity", "Sequential"}
-    assert not any(FAMILY_OF[task].needs for task in with_twin)
+    of_cups = {"Spatial", "Tracking"}
+    assert kinds == {"Object", "Negative", "Capacity", "Sequential"} | of_cups
+    assert len([task for task in with_twin if FAMILY_OF[task].memory not in of_cups]) == 45
+    assert [task for task in with_twin if FAMILY_OF[task].memory in of_cups] == [
+        "ShellGameTouch", "ShellGamePush", "ShellGameShuffleTouch", "ShellGameShuffleTouch-Long",
+        "ShellGameShuffleColorLampTouch", "ShellGameShuffleColorLampTouch-Long",
+    ]  # fmt: skip
     source = environment("mikasa")
     assert source.twin(source.episode("RotateStrictPos", "test", 0)) is None
+
+
+def test_every_task_has_facts() -> None:
+    assert not [task for task in FAMILY_OF if facts_of_task(task) is SceneFacts]
 
 
 # In the simulator ---------------------------------------------------------------------------------
@@ -156,3 +167,262 @@ def test_what_a_rotation_begins_from_is_needed_once_the_peg_turns() -> None:
     (fact,) = episode.facts
     assert fact.frames[0] == 0 and fact.needed == (fact.frames[1] + 1,)
     assert fact.needed[0] < episode.length and fact.value.endswith("degrees")
+
+
+# In the simulator, with models that stand in for lamps and cups -----------------------------------
+
+HOLD = np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
+
+
+class Watched:
+    """An episode that is played by the test, and what the simulator shows at each of its steps."""
+
+    def __init__(self, task: str, episode: int = 0) -> None:
+        self.env = environment("mikasa").open(task, "test", episode, render=False)
+        self.env.reset()
+        self.scene = self.env.env.scene
+        self.places: dict[str, list[np.ndarray]] = {}
+        self.report: dict[str, Any] = {}
+        self._things = {}
+        for name in _WATCHED:
+            things = getattr(self.scene, name, [])
+            if not isinstance(things, list):
+                things = [things]
+            self._things.update({f"{name} {i}": thing for i, thing in enumerate(things)})
+        self._watch()
+
+    def _watch(self) -> None:
+        for name, actor in self._things.items():
+            self.places.setdefault(name, []).append(place_of(actor))
+
+    def play(self, actions: Iterable[np.ndarray]) -> None:
+        """Perform actions, each of which is asked for after the one before."""
+        for action in actions:
+            *_, self.report = self.env.step(action)
+            self._watch()
+
+    def hold(self, steps: int) -> None:
+        self.play([HOLD] * steps)
+
+    def press(self, button: Any) -> None:
+        """Press a button with the hand, and lift it again."""
+        hand = Hand(self.scene)
+        above = np.add(place_of(button), [0, 0, 0.2])
+        self.play(hand.go(above, 0.01, CLOSED))
+        self.play(hand.go(np.add(place_of(button), [0, 0, 0.02]), 0.01, CLOSED, steps=12))
+        self.play(hand.go(above, 0.01, CLOSED))
+
+    def put(self, thing: Any, place: Any) -> None:
+        """Move a thing to a place [3], where it lies still from the next step on."""
+        pose = thing.pose.raw_pose.clone()
+        pose[0, :3] = torch.as_tensor(np.asarray(place), dtype=pose.dtype)
+        thing.pose = pose
+        thing.set_linear_velocity(torch.zeros(1, 3))
+
+    def seen(self, name: str) -> list[tuple[int, int]]:
+        """First and last frame of each time in which a thing was in view."""
+        return runs([place[2] < 1 for place in self.places[name]])
+
+    def frames(self, name: str) -> list[tuple[int, int]]:
+        """First and last frame of each fact whose name begins so."""
+        return [fact.frames for fact in self.env.facts if fact.name.startswith(name)]
+
+
+_WATCHED = ("lamp_bulb_on", "lamp_bulbs_on", "red_cube", "mug_left", "mug_center", "mug_right",
+            "red_ball", "ball_red", "ball_green", "ball_blue")  # fmt: skip
+
+
+def runs(holds: Sequence[bool]) -> list[tuple[int, int]]:
+    """First and last index of each run of true values."""
+    edges = np.diff(np.concatenate([[0], np.asarray(holds, int), [0]]))
+    begins, ends = np.nonzero(edges == 1)[0], np.nonzero(edges == -1)[0]
+    return list(zip(begins.tolist(), (ends - 1).tolist(), strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lamp_model", "cup_model")
+@pytest.mark.parametrize("episode", range(3))
+@pytest.mark.parametrize(
+    "task",
+    ["ShellGameTouch", "ShellGamePush", "ShellGameColorLampTouch", "ShellGameShuffleTouch",
+     "ShellGameShuffleColorLampTouch"],
+)  # fmt: skip
+def test_a_ball_is_a_fact_until_a_cup_is_over_it_and_so_is_each_swap(
+    task: str, episode: int
+) -> None:
+    watched = Watched(task, episode)
+    watched.hold(watched.env.env.cue_end + 3)
+    cups = np.stack([watched.places[f"mug_{name} 0"] for name in ("left", "center", "right")])
+    first_covered = 0
+    for color in ("red", "green", "blue"):
+        name = f"ball_{color} 0" if "Color" in task else "red_ball 0"
+        if name not in watched.places:
+            continue
+        ball = np.stack(watched.places[name])
+        gaps = np.linalg.norm(cups[:, :, :2] - ball[None, :, :2], axis=2)
+        over = cups[:, :, 2] + 1.3 * 0.04 > ball[None, :, 2] + 0.02
+        is_covered = (gaps < 0.03) & over & (cups[:, :, 2] < 1)
+        shown = runs((ball[:, 2] < 1) & ~is_covered.any(axis=0))
+        facts = [fact for fact in watched.env.facts if fact.name in ("ball", f"{color} ball")]
+        assert [fact.frames for fact in facts] == shown and len(shown) == 1
+        side = ("left", "center", "right")[int(gaps[:, 0].argmin())]
+        assert facts[0].value == f"{side} cup"
+        first_covered = max(first_covered, shown[0][1] + 1)
+    decision = max(first_covered, watched.env.env.cue_end)
+    assert all(fact.needed == (decision,) for fact in watched.env.facts)
+
+    # A swap is seen while cups are between their places.
+    places = cups[:, 0, :2]
+    gaps = np.linalg.norm(cups[:, :, None, :2] - places, axis=3)
+    away = gaps.min(axis=2) > 1e-6
+    moving = away.any(axis=0) & (cups[:, :, 2] < 1).all(axis=0) & ("Shuffle" in task)
+    assert watched.frames("swap") == runs(moving)
+    assert bool(moving.any()) == ("Shuffle" in task)
+    for fact in watched.env.facts:
+        if fact.name.startswith("swap"):
+            middle = sum(fact.frames) // 2
+            kept = gaps[~away[:, middle], middle].argmin(axis=1)
+            exchanged = np.delete(["left", "center", "right"], kept)
+            assert fact.value == " and ".join(exchanged)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lamp_model")
+def test_blinks_and_presses_are_counts() -> None:
+    watched = Watched("BlinkCountButtonPressEasy", 0)
+    scene = watched.scene
+    watched.hold(watched.env.env.cue_end)
+    lit = watched.seen("lamp_bulb_on 0")
+    assert len(lit) == int(scene.target_blinks[0]) == 3
+    assert watched.frames("blink") == lit
+    counted = []
+    for number in (1, 2):
+        watched.press(scene.button_cap)
+        assert int(scene.press_count[0]) == number
+        counted.append(watched.env.facts[-1].frames[1] + 1)
+    values = [(fact.name, fact.value) for fact in watched.env.facts]
+    assert values == [("blink 1", "1"), ("blink 2", "2"), ("blink 3", "3"), ("press 1", "1"),
+                      ("press 2", "2")]  # fmt: skip
+    assert watched.env.facts[0].needed == (watched.env.env.cue_end, *counted)
+    assert watched.env.facts[0].changed == lit[1][0] and watched.env.facts[2].changed is None
+    assert watched.env.facts[3].changed == watched.env.facts[4].frames[0]
+
+
+def shape_of(path: np.ndarray) -> str:
+    """The name and size of a closed path [n, 2], by its area."""
+    x, y = (path - path.mean(axis=0)).T
+    radius = np.hypot(x, y).max()
+    area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2 / radius**2
+    areas = {"circle": np.pi, "square": 2, "triangle": 3 * 3**0.5 / 4}
+    name = min(areas, key=lambda name: abs(areas[name] - area))
+    return f"{name} of {radius:.2f} m"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lamp_model")
+@pytest.mark.parametrize("episode", range(3))
+def test_what_the_red_cube_traced_is_needed_when_it_is_gone(episode: int) -> None:
+    watched = Watched("TraceShapeHard", episode)
+    watched.hold(watched.env.env.cue_end + 2)
+    (fact,) = watched.env.facts
+    path = np.stack(watched.places["red_cube 0"])
+    first, last = fact.frames
+    assert watched.seen("red_cube 0") == [(0, last)]
+    assert np.allclose(path[:first, :2], path[first, :2])
+    assert (np.diff(path[first : last + 1, :2], axis=0) != 0).any(axis=1).all()
+    assert fact.value == shape_of(path[first : last + 1, :2])
+    assert fact.needed == (last + 1,)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lamp_model")
+def test_shapes_of_a_sequence_and_what_was_traced_of_them_are_facts() -> None:
+    watched = Watched("TraceShapeSeqHard", 0)
+    begin = watched.env.env.cue_end
+    watched.hold(begin)
+    shapes = watched.env.facts
+    paths = []
+    for fact in shapes:
+        first, last = fact.frames
+        paths.append(np.stack(watched.places["red_cube 0"][first : last + 1]))
+        assert fact.value == shape_of(paths[-1][:, :2])
+    assert [fact.name for fact in shapes] == ["shape 1", "shape 2"]
+    assert shapes[0].frames[1] + 1 == shapes[1].frames[0] and shapes[1].frames[1] == begin - 1
+    for place in [*paths[0], paths[0][0]]:
+        watched.put(watched.scene.green_cube, place)
+        watched.hold(1)
+    assert bool(watched.scene.shape_closed[0, 0]) and not bool(watched.scene.shape_closed[0, 1])
+    closed = watched.frames("trace 1")[0][1] + 1
+    assert watched.env.facts[2].value == shapes[0].value
+    assert watched.env.facts[0].needed == (begin, closed) and closed <= begin + len(paths[0]) + 1
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lamp_model")
+def test_the_signal_is_needed_at_the_first_step_at_which_the_cube_counts() -> None:
+    reports = []
+    needed = []
+    for early in (0, 1):
+        watched = Watched("TimedTransferEasy", 0)
+        watched.hold(5)
+        (lit,) = watched.seen("lamp_bulb_on 0")
+        count = int(0.95 * 100)  # steps of the goal, less 5 %
+        watched.hold(lit[0] + count - early - 1 - watched.env.env.time)
+        place = np.add(place_of(watched.scene.red_disc), [0, 0, 0.023])
+        watched.put(watched.scene.blue_cube, place)
+        watched.hold(1)
+        reports.append(watched.report["status"])
+        (fact,) = watched.env.facts
+        assert fact.frames == (lit[0], lit[0]) and fact.value == f"step {lit[0]}"
+        needed.append(fact.needed)
+        watched.env.close()
+    assert reports == ["success", "fail"]
+    assert needed == [(lit[0] + count,), ()]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lamp_model")
+def test_the_colour_of_a_flash_is_needed_once_all_cubes_are_gathered() -> None:
+    watched = Watched("GatherAndRecall3", 0)
+    scene = watched.scene
+    for number, cube in enumerate(scene.cubes):
+        watched.put(cube, np.add(place_of(scene.disc), [0.06 * number - 0.06, 0, 0.025]))
+        watched.hold(20)
+    lit = {
+        name: watched.seen(f"lamp_bulbs_on {i}") for i, name in enumerate(("red", "green", "blue"))
+    }
+    (fact,) = watched.env.facts
+    assert [fact.frames] == lit[fact.value] and sum(map(len, lit.values())) == 1
+    (needed,) = fact.needed
+    assert fact.frames[1] < needed and 40 < needed <= 45, "the third cube comes to lie still"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lamp_model")
+@pytest.mark.parametrize("task", ["BatteriesCheckerEasy-3", "BatteriesCheckerHard-3"])
+def test_a_battery_in_the_socket_is_needed_after_each_press(task: str) -> None:
+    watched = Watched(task, 0)
+    scene = watched.scene
+    confirmed = []
+    lit = []
+    (working,) = scene.working_mask[0].nonzero().reshape(-1).tolist()
+    for check, number in enumerate((working, (working + 1) % 3), 1):
+        begin = watched.env.env.time + 1
+        battery = scene.batteries[number]
+        watched.put(battery, scene.socket_slot_pos[0].numpy())
+        watched.hold(3)
+        if "Hard" in task:
+            watched.put(battery, scene.tray_slot_positions[0, number].numpy())
+        watched.hold(10)
+        lit.append(any(place[2] < 1 for place in watched.places["lamp_bulb_on 0"][begin:]))
+        fact = watched.env.facts[-1]
+        result = "works" if lit[-1] else "does not work"
+        assert (fact.name, fact.value) == (f"check {check}", f"battery {number + 1} {result}")
+        assert fact.frames[0] == begin and fact.frames[1] < begin + 12
+        watched.press(scene.button_cap)
+        confirmed.append(watched.env.facts[-1].needed[-1])
+        assert begin + 12 < confirmed[-1] <= watched.env.env.time
+    assert lit == [True, False]
+    checks = watched.env.facts
+    assert len(checks) == 2 and checks[0].needed == tuple(confirmed)
+    assert int(scene.checked_count[0]) == 2
