@@ -201,11 +201,11 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
         UserError: a value refers to a key that is not there.
     """
     try:
-        plain = OmegaConf.to_container(cfg, resolve=True)
+        values = OmegaConf.to_container(cfg, resolve=True)
     except InterpolationKeyError as error:
         detail = str(error).splitlines()[0]
         raise UserError(
             f"The value of {error.full_key} refers to another key: {detail}. Add that key to your"
             " YAML file; a model's file says `name: <its name>`."
         ) from None
-    return {str(key): value for key, value in plain.items()}  # type: ignore[union-attr]
+    return {str(key): value for key, value in values.items()}  # type: ignore[union-attr]

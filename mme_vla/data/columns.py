@@ -186,7 +186,7 @@ def _facts(source: EpisodeSource, key: str) -> tuple[np.ndarray, np.ndarray]:
     begins = np.zeros(source.lengths.sum(), np.float32)
     is_visible = np.zeros_like(begins)
     starts = np.cumsum(source.lengths) - source.lengths
-    shown: dict[tuple[int, str], list[tuple[int, int]]] = {}
+    spans: dict[tuple[int, str], list[tuple[int, int]]] = {}
     rows = table[list(kinds)].itertuples(index=False)
     for line, (episode, first, last, task, fact) in enumerate(rows, start=2):
         require(
@@ -200,7 +200,7 @@ def _facts(source: EpisodeSource, key: str) -> tuple[np.ndarray, np.ndarray]:
             f"{key}: line {line} of {path} is of the task {brief(task)}; episode {episode} of"
             f" {source.name} is one of {known}. Record the dataset again.",
         )
-        earlier = shown.setdefault((episode, fact), [])
+        earlier = spans.setdefault((episode, fact), [])
         require(
             not any(first <= end and begin <= last for begin, end in earlier),
             f"{key}: line {line} of {path} has the fact {brief(fact)} at frames {first} to {last}"

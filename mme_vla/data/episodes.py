@@ -23,7 +23,7 @@ from mme_vla.data.consistency import (
 from mme_vla.data.episode_table import Description, read_episode_table
 from mme_vla.data.frame_tables import check_vectors, flat, open_table, read_index_columns
 from mme_vla.data.hdf5 import SUBGOALS
-from mme_vla.data.image_consistency import check_mode, first_wrong
+from mme_vla.data.image_consistency import check_mode
 from mme_vla.data.lerobot_files import (
     REMEDY,
     RENDERED_SUFFIX,
@@ -479,32 +479,29 @@ class EpisodeSource:
     def _read_exec_starts(
         self, rows: Mapping[str, np.ndarray], side_file: Path | None
     ) -> np.ndarray:
-        marked = None
+        in_tables = None
         if "is_demo" in rows:
             demo = rows["is_demo"].astype(bool)
-            marked = np.add.reduceat(demo, self._starts, dtype=np.int64)
+            in_tables = np.add.reduceat(demo, self._starts, dtype=np.int64)
             frame = np.arange(len(demo)) - np.repeat(self._starts, self.lengths)
-            if not np.array_equal(demo, frame < np.repeat(marked, self.lengths)):
+            if not np.array_equal(demo, frame < np.repeat(in_tables, self.lengths)):
                 raise UserError(
                     f"{self.root}: is_demo must be true for an episode's first frames only."
                 )
         elif "exec_start_idx" in rows:
-            marked = rows["exec_start_idx"][self._starts]
+            in_tables = rows["exec_start_idx"][self._starts]
         if side_file is not None:
             starts = read_exec_starts(side_file, len(self))
-            expected = starts
-            if marked is not None:
-                expected = marked
-            episode = first_wrong(starts != expected)
-            if episode is not None:
+            if in_tables is not None and not np.array_equal(starts, in_tables):
+                episode = int(np.flatnonzero(starts != in_tables)[0])
                 raise UserError(
                     f"{side_file}: episode {episode} starts execution at frame {starts[episode]},"
-                    f" but by the tables of {self.root} at {expected[episode]}. Correct the one"
+                    f" but by the tables of {self.root} at {in_tables[episode]}. Correct the one"
                     " that is wrong; a dataset that marks its conditioning videos needs no side"
                     " file."
                 )
-        elif marked is not None:
-            starts = marked
+        elif in_tables is not None:
+            starts = in_tables
             if "is_demo" not in rows:
                 log.warning(
                     "%s has no is_demo; its exec_start_idx says where the conditioning video ends.",

@@ -396,9 +396,9 @@ def check_processor(policy: "Policy", source: str) -> None:
             " from two checkpoints, or one was changed."
         )
     # Settings that both files hold; where the tokenizer lies is each one's own.
-    written = to_json(processor.to_config())
-    for name, expected in (policy.config.get("processor") or {}).items():
-        actual = written.get(name)
+    settings = to_json(processor.to_config())
+    for name, expected in PolicySections.of(policy.config).processor.items():
+        actual = settings.get(name)
         if name != "tokenizer" and actual is not None:
             require(
                 expected in (None, actual),

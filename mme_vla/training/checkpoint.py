@@ -209,10 +209,10 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
     _check_fit(folder / "model.safetensors", averaged, state)
     _check_fit(folder / RAW, raw, parameters)
     # A parameter that never had a gradient has none of them.
-    moved = {name.rpartition("/")[0] for name in moments}
+    optimized = {name.rpartition("/")[0] for name in moments}
     required: dict[str, Tensor] = {}
     for name, p in parameters.items():
-        if name in moved:
+        if name in optimized:
             required |= {f"{name}/{key}": p for key in MOMENTS}
             required[f"{name}/step"] = torch.zeros(())
     _check_fit(folder / OPTIMIZER, moments, required)

@@ -197,11 +197,11 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
     """Dotted keys that a run may not change, with their values in two plain configurations."""
     before = flat(to_json(old))
     after = flat(to_json(new))
-    for settings in (before, after):
+    for values in (before, after):
         # A cosine without an end of its own ends with the run.
-        is_cosine = settings.get("train.schedule") == "cosine"
-        if is_cosine and settings.get("train.schedule_steps") is None:
-            settings["train.schedule_steps"] = settings.get("train.steps")
+        is_cosine = values.get("train.schedule") == "cosine"
+        if is_cosine and values.get("train.schedule_steps") is None:
+            values["train.schedule_steps"] = values.get("train.steps")
     differing: dict[str, tuple[Any, Any]] = {}
     for key in sorted(before.keys() | after.keys()):
         may_differ = any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)

@@ -97,12 +97,12 @@ def test_one_process_does_not_run_what_shards_share(
     check_sharing(tmp_path, second)
 
 
-def test_a_process_starts_while_another_looks_whether_it_is_alive(tmp_path: Path) -> None:
+def test_a_process_starts_while_another_checks_that_it_is_alive(tmp_path: Path) -> None:
     path = tmp_path / "episodes-0of2.jsonl"
     path.touch()
-    with path.open("rb") as looking:
-        fcntl.flock(looking, fcntl.LOCK_SH)  # as `Claims` does, for a moment
-        threading.Timer(0.1, looking.close).start()
+    with path.open("rb") as probe:
+        fcntl.flock(probe, fcntl.LOCK_SH)  # as `Claims` does, for a moment
+        threading.Timer(0.1, probe.close).start()
         RecordLog(path).close()
 
 

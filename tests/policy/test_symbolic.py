@@ -128,11 +128,11 @@ def test_a_recording_shows_the_past_actions_that_training_reads(source, offset):
     for index in (0, 1, 20):
         identity = map_frames((), start + index + 1, start)
         expected = data.past_actions(data.step(index), identity)
-        whole, stepwise = (policy.start_episode("press the button") for _ in range(2))
-        recording.show(whole, 0, start + index + 1, no_frames)
+        at_once, stepwise = (policy.start_episode("press the button") for _ in range(2))
+        recording.show(at_once, 0, start + index + 1, no_frames)
         for first, stop in ((0, start - 3), (start - 3, start + 1), (start + 1, start + index + 1)):
             recording.show(stepwise, first, stop, no_frames)
-        for episode in (whole, stepwise):
+        for episode in (at_once, stepwise):
             assert episode.n_observed_frames == start + index + 1
             assert np.array_equal(episode._executed, expected), index
 

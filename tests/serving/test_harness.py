@@ -230,14 +230,17 @@ def test_a_state_that_cannot_be_read_ends_its_episode_alone(policy: MMEPolicy) -
         context = SimpleNamespace(session_id=str(number))
         running = harness.Running(policy.start_episode("", seed=42))
         server.sessions[context.session_id] = running
-        seen = benchmark.observation()
+        observation = benchmark.observation()
         if benchmark is broken:
-            seen["states"][:] = np.nan
-        images = {"front": seen["images"]["agentview"], "wrist": seen["images"]["wrist"]}
+            observation["states"][:] = np.nan
+        images = {
+            "front": observation["images"]["agentview"],
+            "wrist": observation["images"]["wrist"],
+        }
         running.images.append(images)
-        running.states.append(seen["states"])
+        running.states.append(observation["states"])
         contexts.append(context)
-        observations.append(seen)
+        observations.append(observation)
     failed, answered = server.predict_batch(observations, contexts)
     with pytest.raises(UserError, match="states must be finite"):
         server._normalize_result(failed, contexts[0])

@@ -154,15 +154,15 @@ def test_resuming_with_other_settings_lists_them(two_steps: Path, tmp_path: Path
         open_run(tmp_path / "new", str(two_steps), {"train": {**RECIPE, "steps": 1}, "seed": 1})
 
 
-def test_a_cosine_that_ends_with_its_run_is_not_drawn_out_by_more_steps() -> None:
+def test_a_cosine_that_ends_with_its_run_is_not_stretched_by_more_steps() -> None:
     def changed(then: dict[str, Any], now: dict[str, Any]) -> set[str]:
         return set(differing_keys({"train": then}, {"train": now}))
 
     ends_with_run = {"schedule": "cosine", "schedule_steps": None, "steps": 2}
     assert changed(ends_with_run, {**ends_with_run, "steps": 9}) == {"train.schedule_steps"}
     assert not changed(ends_with_run, {**ends_with_run, "steps": 9, "schedule_steps": 2})
-    own_end = {**ends_with_run, "schedule_steps": 50}
-    assert not changed(own_end, {**own_end, "steps": 9})
+    same_end = {**ends_with_run, "schedule_steps": 50}
+    assert not changed(same_end, {**same_end, "steps": 9})
     constant = {**ends_with_run, "schedule": "constant"}
     assert not changed(constant, {**constant, "steps": 9})
 

@@ -388,8 +388,8 @@ class Covered(SceneFacts):
         self._is_decided |= decides
         since = time - int(scene.cue_steps_per_env[0])
         if hasattr(scene, "swap_pairs") and since >= 0:
-            swap, moved = divmod(since, int(scene.steps_per_swap_per_env[0]))
-            if moved and swap < int(scene.num_swaps_per_env[0]):
+            swap, phase = divmod(since, int(scene.steps_per_swap_per_env[0]))
+            if phase and swap < int(scene.num_swaps_per_env[0]):
                 pair = scene.swap_pairs[0, swap].tolist()
                 before = scene.slot_of_mug[0, swap].tolist()
                 value = " and ".join(_CUPS[place] for place in pair)
@@ -416,12 +416,12 @@ class Covered(SceneFacts):
             scene.oracle_info[:] = after[right]
         else:
             self._right[:] = (right + 1) % 3
-            moved = (int(self._right[0]) - right) * scene.MIN_DIST
+            distance = (int(self._right[0]) - right) * scene.MIN_DIST
             for name in ("red_ball", "goal_site"):
                 if hasattr(scene, name):
                     thing = getattr(scene, name)
                     pose = thing.pose.raw_pose.clone()
-                    pose[:, 1] += moved
+                    pose[:, 1] += distance
                     thing.pose = pose
 
     def candidates(self, time: int) -> Candidates | None:
@@ -534,10 +534,10 @@ class Checked(SceneFacts):
     def visible_facts(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
         scene = self._scene
         battery = int(scene.active_battery_idx[0])
-        is_shown = bool(scene.new_insert_event[0]) or _in_view(scene.lamp_bulb_on)
-        is_shown |= int(scene.action_stage[0]) == scene.STAGE_RETURN
+        is_visible = bool(scene.new_insert_event[0]) or _in_view(scene.lamp_bulb_on)
+        is_visible |= int(scene.action_stage[0]) == scene.STAGE_RETURN
         visible = {}
-        if battery >= 0 and is_shown:
+        if battery >= 0 and is_visible:
             result = "works" if bool(scene.working_mask[0, battery]) else "does not work"
             number = int(scene.checked_count[0]) + 1
             visible[f"check {number}"] = VisibleFact(f"battery {battery + 1} {result}")

@@ -21,6 +21,7 @@ from mme_vla.errors import brief, listed, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, read_records
 from mme_vla.evaluation.store import RECORDS, RUN_FILE, find_records, read_run
 from mme_vla.policy.saving import composition_digest
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import decoding, read_json, read_text
 
@@ -269,10 +270,8 @@ def _check_identity(
     records: Sequence[EpisodeRecord],
 ) -> None:
     """Make sure that the four files are of one training."""
-    memory = config.get("memory")
-    budgets = {"its name": facts.row.partition("@")[2] or None}
-    if isinstance(memory, Mapping):
-        budgets[CONFIG] = memory.get("budget")
+    memory = PolicySections.of(config, str(folder / CONFIG)).memory
+    budgets = {"its name": facts.row.partition("@")[2] or None, CONFIG: memory.get("budget")}
     for place, budget in budgets.items():
         require(
             budget is None or str(budget) == str(facts.budget),

@@ -149,8 +149,8 @@ def test_a_twin_differs_in_one_fact_and_the_script_solves_it(task: str) -> None:
         candidates.append(reached)
         env.close()
     np.testing.assert_array_equal(states[0][0], states[1][0], "the robot begins elsewhere")
-    shown = [[fact for fact in one if not fact.name.startswith("touch")] for one in facts]
-    changed = [a.value != b.value for a, b in zip(*shown, strict=True)]
+    visible = [[fact for fact in one if not fact.name.startswith("touch")] for one in facts]
+    changed = [a.value != b.value for a, b in zip(*visible, strict=True)]
     assert sum(changed) == (2 if task.startswith("Chain") else 1)
     assert all(fact.needed for one in facts for fact in one)
     np.testing.assert_allclose(candidates[0].places, candidates[1].places, atol=0.01)
@@ -219,7 +219,7 @@ class Watched:
         thing.pose = pose
         thing.set_linear_velocity(torch.zeros(1, 3))
 
-    def seen(self, name: str) -> list[tuple[int, int]]:
+    def spans(self, name: str) -> list[tuple[int, int]]:
         """First and last frame of each time in which a thing was in view."""
         return runs([place[2] < 1 for place in self.places[name]])
 
@@ -262,12 +262,12 @@ def test_a_ball_is_a_fact_until_a_cup_is_over_it_and_so_is_each_swap(
         gaps = np.linalg.norm(cups[:, :, :2] - ball[None, :, :2], axis=2)
         over = cups[:, :, 2] + 1.3 * 0.04 > ball[None, :, 2] + 0.02
         is_covered = (gaps < 0.03) & over & (cups[:, :, 2] < 1)
-        shown = runs((ball[:, 2] < 1) & ~is_covered.any(axis=0))
+        visible = runs((ball[:, 2] < 1) & ~is_covered.any(axis=0))
         facts = [fact for fact in watched.env.facts if fact.name in ("ball", f"{color} ball")]
-        assert [fact.frames for fact in facts] == shown and len(shown) == 1
+        assert [fact.frames for fact in facts] == visible and len(visible) == 1
         side = ("left", "center", "right")[int(gaps[:, 0].argmin())]
         assert facts[0].value == f"{side} cup"
-        first_covered = max(first_covered, shown[0][1] + 1)
+        first_covered = max(first_covered, visible[0][1] + 1)
     decision = max(first_covered, watched.env.env.cue_end)
     assert all(fact.needed == (decision,) for fact in watched.env.facts)
 
@@ -281,8 +281,8 @@ def test_a_ball_is_a_fact_until_a_cup_is_over_it_and_so_is_each_swap(
     for fact in watched.env.facts:
         if fact.name.startswith("swap"):
             middle = sum(fact.frames) // 2
-            kept = gaps[~away[:, middle], middle].argmin(axis=1)
-            exchanged = np.delete(["left", "center", "right"], kept)
+            staying = gaps[~away[:, middle], middle].argmin(axis=1)
+            exchanged = np.delete(["left", "center", "right"], staying)
             assert fact.value == " and ".join(exchanged)
 
 
@@ -292,7 +292,7 @@ def test_blinks_and_presses_are_counts() -> None:
     watched = Watched("BlinkCountButtonPressEasy", 0)
     scene = watched.scene
     watched.hold(watched.env.env.cue_end)
-    lit = watched.seen("lamp_bulb_on 0")
+    lit = watched.spans("lamp_bulb_on 0")
     assert len(lit) == int(scene.target_blinks[0]) == 3
     assert watched.frames("blink") == lit
     counted = []
@@ -327,7 +327,7 @@ def test_what_the_red_cube_traced_is_needed_when_it_is_gone(episode: int) -> Non
     (fact,) = watched.env.facts
     path = np.stack(watched.places["red_cube 0"])
     first, last = fact.frames
-    assert watched.seen("red_cube 0") == [(0, last)]
+    assert watched.spans("red_cube 0") == [(0, last)]
     assert np.allclose(path[:first, :2], path[first, :2])
     assert (np.diff(path[first : last + 1, :2], axis=0) != 0).any(axis=1).all()
     assert fact.value == shape_of(path[first : last + 1, :2])
@@ -365,7 +365,7 @@ def test_the_signal_is_needed_at_the_first_step_at_which_the_cube_counts() -> No
     for early in (0, 1):
         watched = Watched("TimedTransferEasy", 0)
         watched.hold(5)
-        (lit,) = watched.seen("lamp_bulb_on 0")
+        (lit,) = watched.spans("lamp_bulb_on 0")
         count = int(0.95 * 100)  # steps of the goal, less 5 %
         watched.hold(lit[0] + count - early - 1 - watched.env.env.time)
         place = np.add(place_of(watched.scene.red_disc), [0, 0, 0.023])
@@ -389,7 +389,7 @@ def test_the_colour_of_a_flash_is_needed_once_all_cubes_are_gathered() -> None:
         watched.put(cube, np.add(place_of(scene.disc), [0.06 * number - 0.06, 0, 0.025]))
         watched.hold(20)
     lit = {
-        name: watched.seen(f"lamp_bulbs_on {i}") for i, name in enumerate(("red", "green", "blue"))
+        name: watched.spans(f"lamp_bulbs_on {i}") for i, name in enumerate(("red", "green", "blue"))
     }
     (fact,) = watched.env.facts
     assert [fact.frames] == lit[fact.value] and sum(map(len, lit.values())) == 1

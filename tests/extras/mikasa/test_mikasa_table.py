@@ -163,10 +163,10 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, stop: int) -> None:
     commands = Commands(stop)
     with pytest.raises(KeyboardInterrupt):
         measure(arguments(tmp_path), commands)
-    rest = Commands()
-    rows = measure(arguments(tmp_path), rest)
+    commands = Commands()
+    rows = measure(arguments(tmp_path), commands)
     assert len({(row["model"], row["seed"], row["task"]) for row in rows}) == len(rows) == 8
-    done = commands.done + rest.done
+    done = commands.done + commands.done
     assert (done.count("record"), done.count("train"), done.count("analyse")) == (2, 4, 1)
 
 
@@ -175,9 +175,9 @@ def test_a_row_that_is_missing_is_made_again(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:-1]))
-    rest = Commands()
-    assert len(measure(arguments(tmp_path), rest)) == 8
-    assert rest.done == ["evaluate", "evaluate", "probe"], "which continue, and repeat nothing"
+    commands = Commands()
+    assert len(measure(arguments(tmp_path), commands)) == 8
+    assert commands.done == ["evaluate", "evaluate", "probe"], "which continue, and repeat nothing"
 
 
 def test_names_that_do_not_exist_are_refused_before_anything_runs(tmp_path: Path) -> None:

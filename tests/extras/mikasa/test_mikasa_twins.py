@@ -69,16 +69,16 @@ def test_only_what_knows_the_fact_is_right_in_both_scenes(
 @pytest.mark.parametrize(
     "task", ["ShellGameTouch", "ShellGameShuffleTouch", "ShellGameShuffleColorLampTouch"]
 )
-def test_twins_of_cups_look_the_same_once_a_decision_depends_on_the_fact(task: str) -> None:
+def test_twins_of_cups_are_equal_once_a_decision_depends_on_the_fact(task: str) -> None:
     source = environment("mikasa")
     images = []
     for row in (None, source.twin(source.episode(task, "test", 1))):
         env = source.open(task, "test", 1, row=row)
         frames, _ = env.reset()
-        seen = [frames]
+        observations = [frames]
         while env.candidates is None:
-            seen.append(env.step(source.hold(env.env))[0])
-        images.append([np.stack([frame[f"{camera}_rgb_list"][-1] for frame in seen])
+            observations.append(env.step(source.hold(env.env))[0])
+        images.append([np.stack([frame[f"{camera}_rgb_list"][-1] for frame in observations])
                        for camera in ("top", "wrist")])  # fmt: skip
         env.close()
     for first, second in zip(*images, strict=True):

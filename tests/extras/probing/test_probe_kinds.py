@@ -132,11 +132,11 @@ def test_a_memory_that_chooses_by_stored_tokens_keeps_its_choice(word: str) -> N
 
     def brightest(history: History, step: int, rng: Any = None) -> np.ndarray:
         """The newest frame and that with the largest token, among the stored ones."""
-        kept = history.stored_frames
-        kept = kept[kept <= step]
-        tokens = history.stored(all_patches(kept, memory.storage.grid))
-        largest = tokens.unflatten(0, (len(kept), -1)).amax((1, 2)).argmax()
-        rows.append(all_patches(np.unique([kept[int(largest)], kept[-1]]), memory.storage.grid))
+        stored = history.stored_frames
+        stored = stored[stored <= step]
+        tokens = history.stored(all_patches(stored, memory.storage.grid))
+        largest = tokens.unflatten(0, (len(stored), -1)).amax((1, 2)).argmax()
+        rows.append(all_patches(np.unique([stored[int(largest)], stored[-1]]), memory.storage.grid))
         return rows[-1]
 
     memory.select = brightest  # type: ignore[method-assign]

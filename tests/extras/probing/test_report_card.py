@@ -362,13 +362,13 @@ def test_a_card_tells_memory_off_from_memoryless_and_takes_a_memoryless_training
     donors = recordings()
     plan = ProbePlan(None, (), donors, JOBS[:2], OfflineSettings(1, 2))
     options = RunOptions(base=make_choice_env)
-    rest = (plan, tmp_path, FACTS, RolloutSettings(), options)
-    alone = run_card(reader(TIME), *rest)
+    arguments = (plan, tmp_path, FACTS, RolloutSettings(), options)
+    alone = run_card(reader(TIME), *arguments)
     assert any("references={memoryless: <folder>}" in note for note in alone.notes)
-    beside = run_card(reader(TIME), *rest, {"memoryless": str(tmp_path / "memoryless")})
+    beside = run_card(reader(TIME), *arguments, {"memoryless": str(tmp_path / "memoryless")})
     assert not any("references=" in note for note in beside.notes)
     assert beside.references == {"memoryless": 0.5}
     assert "(a memoryless training 50 %)" in conclude_card(beside)
     assert "which is not a memoryless policy" in (tmp_path / "card.html").read_text()
     with pytest.raises(UserError, match="holds records of framesamp_modul, which has a memory"):
-        run_card(reader(TIME), *rest, {"memoryless": str(tmp_path / "wrong")})
+        run_card(reader(TIME), *arguments, {"memoryless": str(tmp_path / "wrong")})
