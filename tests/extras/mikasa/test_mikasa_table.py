@@ -163,10 +163,10 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, stop: int) -> None:
     commands = Commands(stop)
     with pytest.raises(KeyboardInterrupt):
         measure(arguments(tmp_path), commands)
-    commands = Commands()
-    rows = measure(arguments(tmp_path), commands)
+    continued = Commands()
+    rows = measure(arguments(tmp_path), continued)
     assert len({(row["model"], row["seed"], row["task"]) for row in rows}) == len(rows) == 8
-    done = commands.done + commands.done
+    done = commands.done + continued.done
     assert (done.count("record"), done.count("train"), done.count("analyse")) == (2, 4, 1)
 
 
