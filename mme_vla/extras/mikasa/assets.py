@@ -1,6 +1,7 @@
 """What scenes of MIKASA-Robo-VLA need beside its package, and where it belongs."""
 
 import os
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -34,19 +35,17 @@ def ycb_file() -> Path:
     return root.expanduser() / _YCB
 
 
-def is_there(need: str | None) -> bool:
-    """Whether what tasks need is on this machine."""
-    if need == BULB:
-        return find_spec(PACKAGE) is not None and bulb_file().is_file()
-    if need == YCB:
-        return ycb_file().is_file()
-    return True
+def are_there(needs: Sequence[str]) -> bool:
+    """Whether all that tasks need is on this machine."""
+    if BULB in needs and not (find_spec(PACKAGE) is not None and bulb_file().is_file()):
+        return False
+    return YCB not in needs or ycb_file().is_file()
 
 
 def check_assets(task: str) -> None:
     """Refuse a task whose models are not on this machine, and say where they come from."""
-    need = FAMILY_OF[task].needs
-    if need == BULB:
+    needs = FAMILY_OF[task].needs
+    if BULB in needs:
         file = bulb_file()
         require(
             file.is_file(),
@@ -55,7 +54,7 @@ def check_assets(task: str) -> None:
             " github.com/CognitiveAISystems/MIKASA-Robo, below mikasa_robo_suite/vla/utils/objects"
             f" (CC BY 4.0). Copy it to {file.parent}.",
         )
-    if need == YCB:
+    if YCB in needs:
         file = ycb_file()
         require(
             file.is_file(),

@@ -17,13 +17,13 @@ class Family:
 
     memory: the kind of memory.
     tasks: name → step limit.
-    needs: `BULB` or `YCB`, what its scenes need beside the package.
+    needs: `BULB`, `YCB`, both or none: what its scenes need beside the package.
     frozen: whether no action has an effect while the cue is shown (except in tasks with `-Long`).
     """
 
     memory: str
     tasks: Mapping[str, int]
-    needs: str | None = None
+    needs: tuple[str, ...] = ()
     frozen: bool = False
 
 
@@ -79,19 +79,26 @@ FAMILIES: Mapping[str, Family] = {
     "TakeItBack": Family("Spatial", {"TakeItBack": 60}),
     "ShellGame": Family(
         "Spatial",
-        {"ShellGameTouch": 30, "ShellGamePush": 30, "ShellGameColorLampTouch": 30},
-        needs=YCB,
+        {"ShellGameTouch": 30, "ShellGamePush": 30},
+        needs=(YCB,),
+        frozen=True,
+    ),
+    "ShellGameColorLamp": Family(
+        "Spatial",
+        {"ShellGameColorLampTouch": 30},
+        needs=(BULB, YCB),
         frozen=True,
     ),
     "ShellGameShuffle": Family(
         "Tracking",
-        {
-            "ShellGameShuffleTouch": 60,
-            "ShellGameShuffleTouch-Long": 600,
-            "ShellGameShuffleColorLampTouch": 60,
-            "ShellGameShuffleColorLampTouch-Long": 600,
-        },
-        needs=YCB,
+        {"ShellGameShuffleTouch": 60, "ShellGameShuffleTouch-Long": 600},
+        needs=(YCB,),
+        frozen=True,
+    ),
+    "ShellGameShuffleColorLamp": Family(
+        "Tracking",
+        {"ShellGameShuffleColorLampTouch": 60, "ShellGameShuffleColorLampTouch-Long": 600},
+        needs=(BULB, YCB),
         frozen=True,
     ),
     "BunchOfColors": Family(
@@ -108,7 +115,7 @@ FAMILIES: Mapping[str, Family] = {
             "BlinkCountButtonPressHard": 300,
             **_sizes("BlinkCountButtonPress", _LEVELS, 1200, "-Long"),
         },
-        needs=BULB,
+        needs=(BULB,),
     ),
     "TimedTransfer": Family(
         "Temporal",
@@ -120,14 +127,14 @@ FAMILIES: Mapping[str, Family] = {
             "TimedTransferMedium-Long": 900,
             "TimedTransferHard-Long": 1200,
         },
-        needs=BULB,
+        needs=(BULB,),
     ),
     "TraceShape": Family(
         "Procedural",
         {"TraceShapeEasy": 250, "TraceShapeMedium": 300, "TraceShapeHard": 350},
-        needs=BULB,
+        needs=(BULB,),
     ),
-    "TraceShapeSeq": Family("Procedural", _sizes("TraceShapeSeq", _LEVELS, 1500), needs=BULB),
+    "TraceShapeSeq": Family("Procedural", _sizes("TraceShapeSeq", _LEVELS, 1500), needs=(BULB,)),
     "BatteriesChecker": Family(
         "Checklist",
         {
@@ -136,12 +143,12 @@ FAMILIES: Mapping[str, Family] = {
             "BatteriesCheckerHard-3": 1080,
             "BatteriesCheckerHard-6": 2160,
         },
-        needs=BULB,
+        needs=(BULB,),
     ),
     "GatherAndRecall": Family(
         "Prospective",
         {f"GatherAndRecall{number}": 200 * (number + 1) // 2 for number in (1, 3, 5, 7, 9)},
-        needs=BULB,
+        needs=(BULB,),
     ),
 }
 FAMILY_OF = {task: family for family in FAMILIES.values() for task in family.tasks}

@@ -20,7 +20,7 @@ from mme_vla.envs.facts import Candidates, Fact, FactLog
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.rendering import keep_renderer, lean_shaders, links_culled, render_backend
 from mme_vla.errors import check_known, require
-from mme_vla.extras.mikasa.assets import check_assets, check_package, is_there
+from mme_vla.extras.mikasa.assets import are_there, check_assets, check_package
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS, by_horizon, by_memory
 from mme_vla.extras.mikasa.demonstrators import demonstrate, place_of, wrapped
 from mme_vla.extras.mikasa.facts import facts_of_task
@@ -221,7 +221,7 @@ class Mikasa(Environment):
     @property
     def tasks(self) -> tuple[str, ...]:  # type: ignore[override]
         """Those whose models are on this machine."""
-        return tuple(task for task, family in FAMILY_OF.items() if is_there(family.needs))
+        return tuple(task for task, family in FAMILY_OF.items() if are_there(family.needs))
 
     def check_installed(self) -> None:
         check_package()
@@ -229,7 +229,7 @@ class Mikasa(Environment):
     def check_task(self, task: str) -> None:
         """A task of the benchmark, whose models are on this machine."""
         check_known("task", task, FAMILY_OF)
-        if not is_there(FAMILY_OF[task].needs):
+        if not are_there(FAMILY_OF[task].needs):
             check_assets(task)
 
     def episodes(self, task: str, split: str) -> list[EpisodeSpec]:

@@ -116,7 +116,9 @@ def test_the_same_seed_is_the_same_scene_in_a_kept_environment() -> None:
 
 
 @pytest.mark.usefixtures("renderer", "lamp_model")
-@pytest.mark.parametrize("family", [name for name, kind in FAMILIES.items() if kind.needs == BULB])
+@pytest.mark.parametrize(
+    "family", [name for name, kind in FAMILIES.items() if kind.needs == (BULB,)]
+)
 def test_tasks_with_a_lamp_run_once_its_model_is_there(family: str) -> None:
     env = opened(next(iter(FAMILIES[family].tasks)), render=True)
     _, info = env.reset()
