@@ -15,7 +15,7 @@ from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.errors import UserError, counted
 from mme_vla.extras.probing.channels import Remembered
 from mme_vla.extras.probing.recordings import Recording
-from mme_vla.memory.history import History
+from mme_vla.memory.history import DerivedHistory, History
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.registry import PERTURBATIONS
 
@@ -257,17 +257,20 @@ class NoDemo(Perturbation):
         return "the video before the episode is not shown"
 
 
-class _Perturbed(History):
-    """A history whose tokens are perturbed as they are gathered."""
+class _Perturbed(DerivedHistory):
+    """A history whose tokens, proprioception and actions are perturbed as they are read."""
 
     def __init__(
         self, source: History, perturbation: Perturbation, rng: np.random.Generator
     ) -> None:
-        super().__init__(source.spec, source.exec_start)
-        self._source, self._perturbation, self._rng = source, perturbation, rng
+        super().__init__(source)
+        self._perturbation = perturbation
+        self._rng = rng
+        if source.motion is not None:
+            self.motion = self._motion
 
-    def __len__(self) -> int:
-        return len(self._source)
+    def _motion(self, frames: np.ndarray) -> Tensor:
+        return self._perturbation.perturb(self._source.motion_rows(frames), self._rng)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         return self._perturbation.perturb(self._source.gather(indices), self._rng)

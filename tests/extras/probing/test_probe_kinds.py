@@ -118,7 +118,7 @@ def test_every_memory_answers_otherwise_when_its_entries_are_others(kind: str) -
 def test_a_memory_that_reads_the_robots_motion_can_be_probed(model: str) -> None:
     policy = quick_policy(model, 8).eval()
     baseline = chunks(policy, None)[1]
-    for word in ("drop:all", "swap", "recent:4"):
+    for word in ("drop:all", "swap", "recent:4", "noise:1"):
         changed = chunks(policy, word)[1]
         same = [np.array_equal(a, b) for a, b in zip(baseline, changed, strict=True)]
         assert not all(same), word  # a fresh memory changes little
