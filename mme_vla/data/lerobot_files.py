@@ -7,7 +7,9 @@ here, read the table of episodes through a cache whose key is the files' paths a
 take several seconds to import.
 """
 
+import logging
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -25,6 +27,7 @@ from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import decoding, inside, read_json, require_file
 from mme_vla.utils.validation import validated
 
+log = logging.getLogger(__name__)
 SIDE_FILE = "meta/robomme_episodes.json"
 """What LeRobot's columns have no place for: task, seed, difficulty, options of a choice."""
 FACTS = "meta/facts.csv"
@@ -175,18 +178,16 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     action = tuple(columns[key] for key in robot.action.key or ("action",))
     pose = tuple(columns[key] for key in robot.action.pose_key)
     vectors = [("state", state, robot.state.width), ("action", action, robot.action.width)]
-    read_as: dict[str, str] = {}
-    read = [(column, f"the camera {name!r}") for name, column in cameras.items()]
-    read += [(column, "the state") for column in state]
-    read += [(column, "the action") for column in action]
-    for column, what in read:
-        require(
-            column not in read_as,
-            f"{root}: {column} would be read as {read_as.get(column)} and as {what} of the robot"
-            f" {robot.name!r}. Each has a column of its own: correct its key in the section"
-            " embodiment.",
+    counts = Counter([*cameras.values(), *state, *action])
+    repeated = [column for column, count in counts.items() if count > 1]
+    if repeated:
+        log.warning(
+            "%s: the robot %s reads %s more than once, as cameras, state or action (keys in the"
+            " section embodiment).",
+            root,
+            robot.name,
+            listed(repeated),
         )
-        read_as[column] = what
     if pose:
         vectors.append(("tool's pose", pose, POSE_WIDTH))
     for what, names, width in vectors:

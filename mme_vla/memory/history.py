@@ -439,7 +439,11 @@ class PromptConditionedHistory(DerivedHistory):
         self.with_prompt = with_prompt
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self.with_prompt(self._source.gather(indices)[None])[0]
+        return self.with_prompt(self.unconditioned(indices)[None])[0]
+
+    def unconditioned(self, indices: np.ndarray) -> Tensor:
+        """What `gather` conditions."""
+        return self._source.gather(indices)
 
     def stored(self, indices: np.ndarray) -> Tensor:
         return self._source.stored(indices)

@@ -223,15 +223,18 @@ class CoarserHistory(DerivedHistory):
         return FrameScores(scores.frames, rows.reshape(-1, grid**2))
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        tokens = self.stored(indices)
         if isinstance(self._source, PromptConditionedHistory):
             # As in training, the prompt conditions tokens that are pooled.
-            tokens = self._source.with_prompt(tokens[None])[0]
-        return tokens
+            tokens = self._pooled(indices, self._source.unconditioned)
+            return self._source.with_prompt(tokens[None])[0]
+        return self._pooled(indices, self._source.gather)
 
     def stored(self, indices: np.ndarray) -> Tensor:
+        return self._pooled(indices, self._source.stored)
+
+    def _pooled(self, indices: np.ndarray, gather: Callable[[np.ndarray], Tensor]) -> Tensor:
         fine = self._source.spec.grid
-        tokens = self._source.stored(finer(indices, self.spec.grid, fine))
+        tokens = gather(finer(indices, self.spec.grid, fine))
         parts = (fine // self.spec.grid) ** 2
         if parts == 1:
             return tokens

@@ -242,9 +242,8 @@ def check_encoding(memory: Memory, frames: int) -> None:
     assert encoded.mask.shape == shape[:2] and encoded.mask.dtype == torch.bool, (
         f"the mask must be bool {shape[:2]}; got {encoded.mask.dtype} {tuple(encoded.mask.shape)}."
     )
-    assert not memory.timed or (encoded.ages is not None and encoded.ages.shape == shape[:2]), (
-        f"timed is True, so forward must return MemoryTokens with ages {shape[:2]}: give them, or"
-        " set timed = False."
+    assert encoded.ages is None or encoded.ages.shape == shape[:2], (
+        f"the ages must be {shape[:2]}; got {tuple(encoded.ages.shape)}."
     )
     for name, loss in encoded.losses.items():
         assert loss.shape == shape[:1], (

@@ -351,7 +351,6 @@ def test_another_scene_of_the_same_seed_is_noticed(finished: Path) -> None:
         ({"model_seed": 43}, "model_seed"),
         ({"max_steps": 9999}, "max_steps"),
         ({"steps": 5000}, "steps"),
-        ({"steps": -1}, "steps"),
         ({"checkpoint": 7}, "checkpoint"),
         ({"event": "pause:64"}, "event"),
         ({"subgoal": "oracle"}, "subgoal"),

@@ -113,8 +113,10 @@ def test_a_selection_with_a_patch_twice_fails_the_check(rules, monkeypatch):
         ),
         (
             "forward",
-            lambda memory, history: MemoryTokens(torch.ones(2, 16, 48), history.mask),
-            r"timed is True, so .* ages \(2, 16\)",
+            lambda memory, history: MemoryTokens(
+                torch.ones(2, 16, 48), history.mask, ages=torch.ones(2)
+            ),
+            r"ages must be \(2, 16\); got \(2,\)",
         ),
         (
             "forward",
