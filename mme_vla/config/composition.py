@@ -25,7 +25,7 @@ from hydra.errors import OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import InterpolationKeyError
+from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from mme_vla.config import plugins
 from mme_vla.config.naming import join_memories, several_memories
@@ -198,14 +198,14 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
     """A configuration as resolved plain values.
 
     Raises:
-        UserError: a value refers to a key that is not there.
+        UserError: a value refers to a key that is not there, or not set.
     """
     try:
         values = OmegaConf.to_container(cfg, resolve=True)
-    except InterpolationKeyError as error:
+    except InterpolationResolutionError as error:
         detail = str(error).splitlines()[0]
-        raise UserError(
-            f"The value of {error.full_key} refers to another key: {detail}. Add that key to your"
-            " YAML file; a model's file says `name: <its name>`."
-        ) from None
+        text = f"The value of {error.full_key} refers to another one: {detail.rstrip('.')}."
+        if isinstance(error, InterpolationKeyError):
+            text += " Add that key to your YAML file; a model's file says `name: <its name>`."
+        raise UserError(text) from None
     return {str(key): value for key, value in values.items()}  # type: ignore[union-attr]

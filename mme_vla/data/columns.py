@@ -90,7 +90,8 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
     wrong = ~np.isfinite(numbers)
     _check(source, name, key, wrong.any(1) if nested else wrong, "is missing or not finite")
     if pa.types.is_integer(kind):
-        lost = numbers.astype(np.float64) != exact
+        with np.errstate(invalid="ignore"):  # beyond the integers' own range
+            lost = numbers.astype(exact.dtype) != exact
         problem = "holds a whole number that float32 cannot (beyond 2**24)"
         _check(source, name, key, lost.any(1) if nested else lost, problem)
     return numbers
@@ -130,8 +131,8 @@ def text_column(source: EpisodeSource, name: str, key: str) -> Any:
     """A column of texts of a dataset, [rows] of arrow.
 
     Raises:
-        UserError: no such column, another kind, or a text that is missing or empty; it names the
-            episode.
+        UserError: no such column, another kind, or a text that is missing or empty in an execution;
+            it names the episode.
     """
     texts = _read(source, name, key).combine_chunks()
     require(
@@ -139,7 +140,11 @@ def text_column(source: EpisodeSource, name: str, key: str) -> Any:
         f"{key}: the column {name!r} of {source.name} holds {texts.type}, no texts.",
     )
     is_empty = pc.equal(pc.utf8_length(pc.utf8_trim_whitespace(texts)), 0).fill_null(True)
-    _check(source, name, key, is_empty.to_numpy(zero_copy_only=False), "has no text")
+    first_rows = np.cumsum(source.lengths) - source.lengths + source.exec_starts
+    frames = np.arange(len(texts))
+    is_executed = frames >= np.repeat(first_rows, source.lengths)
+    is_empty = is_empty.to_numpy(zero_copy_only=False) & is_executed
+    _check(source, name, key, is_empty, "has no text")
     return texts
 
 
@@ -154,7 +159,7 @@ def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
             f"{error} {source.name} has facts: the label {FACT} counts them"
             f" (memory.label={FACT} for memory=keyframes)."
         ) from None
-    codes = subgoals.dictionary_encode().indices.to_numpy()
+    codes = subgoals.fill_null("").dictionary_encode().indices.to_numpy()
     begins = np.concatenate([[True], np.diff(codes) != 0])
     begins[np.cumsum(source.lengths) - source.lengths] = True
     return begins.astype(np.float32)

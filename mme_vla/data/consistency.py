@@ -170,7 +170,9 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
 
 
 def _check_phases(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
-    """Compare the two columns that say where a conditioning video ends, each with itself too."""
+    """Compare the two columns that say where a conditioning video ends, each with itself too. Flags
+    are 0 or 1.
+    """
     for name, values in rows.items():
         if name != "is_demo" and not name.endswith(RENDERED_SUFFIX):
             continue

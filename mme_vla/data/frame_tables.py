@@ -100,10 +100,11 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
     files = parquet_files(root, "data")
     # Every number but 0 would become true without a word.
     flags = [name for name in columns if features[name].dtype == "bool"]
-    for file in files:
+    for file in files if flags else ():
+        with decoding(file, "a table of frames", REMEDY):
+            schema = pq.read_schema(file)
         for name in flags:
-            with decoding(file, "a table of frames", REMEDY):
-                kind = str(pq.read_schema(file).field(name).type)
+            kind = str(schema.field(name).type)
             require(
                 "bool" in kind,
                 f"{root}: {name} is bool in meta/info.json, but {file.name} holds {kind}. Correct"

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from h5py import Dataset as H5Dataset
 from h5py import Empty, h5d, h5s
 
 from mme_vla.data.waypoints import CHOICE_NUMBERS, known_poses, row_of
@@ -471,7 +472,7 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
                 choices &= all(f"{group}/{name}" in handle for name in CHOICES)
                 partly |= f"{group}/{FRAMES}" in handle
                 image = handle.get(f"{step}/{_IMAGE_KEYS[CAMERAS[0]]}")
-                if image is not None:
+                if isinstance(image, H5Dataset):  # anything else is refused when it is read
                     first = first or {"shape": image.shape, "place": f"{file} {group}"}
                     require(
                         image.shape == first["shape"],

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,15 @@ def open_sources(
             f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its"
             " own."
         )
+    for one, another in combinations(sources, 2):
+        has_same_lengths = np.array_equal(one.lengths, another.lengths)
+        if has_same_lengths and one.fingerprint == another.fingerprint:
+            log.warning(
+                "The sources %s and %s hold the same episodes: what is held out of one may be"
+                " trained on in the other.",
+                one.name,
+                another.name,
+            )
     # They are trained on together. Other rates and other sizes of numbers (degrees beside radians)
     # are a warning: both may be meant.
     first = sources[0]
@@ -171,14 +181,6 @@ def open_sources(
                 " into the other's order.",
             )
             _compare_scales(first, second, kind)
-        is_copy = np.array_equal(first.lengths, second.lengths)
-        if is_copy and first.fingerprint == second.fingerprint:
-            log.warning(
-                "The sources %s and %s hold the same episodes: what is held out of one may be"
-                " trained on in the other.",
-                first.name,
-                second.name,
-            )
         if first.fps != second.fps:
             log.warning(
                 "The source %s has %g frames per second, %s has %g: one step of a chunk is another"

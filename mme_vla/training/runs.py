@@ -168,6 +168,8 @@ def check_settings(checkpoint: Path, then: Mapping[str, Any], now: Mapping[str, 
     if len(lines) > 7:
         lines[7:] = [f"  … and {len(lines) - 7:,} more"]
     listing = "\n".join(lines)
+    if "train.schedule_steps" in changed:
+        listing += "\nA cosine without schedule_steps ends with the run it began in."
     raise UserError(
         f"{checkpoint} was trained with other settings, so continuing from it would be another"
         f" run:\n{listing}\nRepeat the settings of {checkpoint.parent.parent / CONFIG}, or start"

@@ -159,7 +159,9 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
         matched, left = _match_foreign(policy, checkpoint, str(source))
     state = policy.state_dict()
     check_kinds(matched, state, str(source))
-    matched = {name: cast(tensor, state[name].dtype) for name, tensor in matched.items()}
+    for name, tensor in matched.items():
+        if tensor.element_size() > state[name].element_size():  # a number may be too large for it
+            matched[name] = cast(tensor, state[name].dtype)
     check_values(matched, str(source))
     policy.load_state_dict(matched, strict=False)
     return Start(sorted(matched), sorted(set(state) - set(matched)), left)

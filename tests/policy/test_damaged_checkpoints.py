@@ -139,23 +139,12 @@ def test_weights_that_float32_cannot_hold_are_refused(checkpoint: Path) -> None:
         assert f"infinities in 1 tensor: {name}" in refusal(read, checkpoint)
 
 
-@pytest.mark.parametrize(
-    ("edit", "words"),
-    [
-        ({"std": [-1.0] * 8}, "state: std is negative"),
-        ({"min": [-1.0] * 8, "max": [1.0] * 8, "q01": [-3.0] * 8}, "state: q01 lies below min"),
-        ({"min": [-1.0] * 8, "max": [1.0] * 8, "q99": [3.0] * 8}, "state: max lies below q99"),
-        ({"min": [-1.0] * 8, "max": [1.0] * 8, "mean": [3.0] * 8}, "state: max lies below mean"),
-        ({"q99": [1e300] * 8}, "state.q99 must be a list of finite numbers within float32"),
-    ],
-)
-def test_statistics_that_contradict_themselves_are_refused(
-    edit: dict[str, Any], words: str, checkpoint: Path
-) -> None:
+def test_statistics_beyond_float32_are_refused(checkpoint: Path) -> None:
     (checkpoint / SUMS).unlink()
     stats = json.loads((checkpoint / "norm_stats.json").read_text())
-    stats["norm_stats"]["state"].update(edit)
+    stats["norm_stats"]["state"].update({"q99": [1e300] * 8})
     (checkpoint / "norm_stats.json").write_text(json.dumps(stats))
+    words = "state.q99 must be a list of finite numbers within float32"
     assert words in refusal(MMEPolicy.from_pretrained, checkpoint)
 
 

@@ -84,7 +84,7 @@ def run_names(runs: Iterable[RunKey]) -> dict[RunKey, str]:
     for run, name in names.items():
         if counts[name] > 1:
             training = None if run.training is None else asdict(run.training)
-            kind = digest({"composition": run.composition, "training": training}, 6)
+            kind = digest({**run._asdict(), "training": training}, 6)
             names[run] = f"{name}, #{kind}"
     return names
 

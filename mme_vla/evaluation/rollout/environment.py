@@ -546,9 +546,9 @@ class EpisodeFactory:
         arguments |= {"task": task, "split": split, "episode": episode, "max_steps": max_steps}
         if self.base is not make_env:
             return self.base(**arguments)
-        arguments |= {"action_space": self.robot.action.space, "render": self.render}
+        arguments = {"action_space": self.robot.action.space, "render": self.render, **arguments}
         if self.env != ROBOMME:
             return open_episode(self.env, **arguments)
         readings = dict.fromkeys(self.robot.readings, True)
         include = Include(**readings, possible=self.only_possible)
-        return make_env(**arguments, reward=self.reward, include=include)
+        return make_env(**{"reward": self.reward, "include": include, **arguments})

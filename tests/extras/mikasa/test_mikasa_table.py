@@ -191,7 +191,7 @@ def test_names_that_do_not_exist_are_refused_before_anything_runs(tmp_path: Path
 def test_the_choice_of_tasks_has_every_kind_of_memory_that_runs() -> None:
     kinds = {FAMILY_OF[task].memory for task in TASKS}
     assert len(set(TASKS)) == 24
-    assert kinds == {family.memory for family in FAMILY_OF.values() if family.needs is None}
+    assert kinds == {family.memory for family in FAMILY_OF.values() if not family.needs}
     longer = [task for task in TASKS if STEPS[task] > MOST_STEPS]
     assert {FAMILY_OF[task].memory for task in longer} == {"Capacity", "Sequential"}
     assert set(TASKS) <= set(environment(mikasa_table.ENV).tasks)

@@ -378,7 +378,6 @@ def test_an_incomplete_split_is_named(tmp_path: Path) -> None:
         ({"training": TrainingIdentity(0, "r", "x", "framesamp_modul0")}, "training of BinFill 0"),
         ({"composition": "0123"}, "composition of BinFill 0 is 0123 .*config.yaml"),
         ({"checkpoint": 7}, "checkpoint of BinFill 0 is 7 .*run.json"),
-        ({"memory_budget": 16}, "memory_budget of BinFill 0 is 16 .*, but 32 in trained.json"),
         ({"max_steps": 900}, "max_steps of BinFill 0 is 900 .*, but 500 in run.json"),
         ({"made_up": True}, "made_up of BinFill 0 is True"),
     ],
@@ -413,19 +412,11 @@ def test_changed_settings_and_facts_are_named(tmp_path: Path) -> None:
         ("config.yaml", "[1, 2]", r"config.yaml must hold sections of keys, not \[1, 2\]"),
         ("config.yaml", "[" * 5000, r"config.yaml is damaged: .*RecursionError"),
         ("config.yaml", "name: a\nname: b", r"config.yaml is damaged: .*duplicate key name"),
-        ("config.yaml", "memory: {budget: 64}", r"has 32 memory tokens .* but 64 by config.yaml"),
-        (
-            "trained.json",
-            {"row": "framesamp_modul@64"},
-            r"memory tokens .* but .64. by its name",
-        ),
         ("trained.json", {"cpu_minutes": -1.0}, r"cpu_minutes=-1.0 must be"),
         ("../../scenes.json", {"tried": [1]}, r"scenes.json: tried must be a section of keys"),
     ],
 )
-def test_a_file_of_another_form_or_budget_is_named(
-    tmp_path: Path, name: str, text: Any, words: str
-) -> None:
+def test_a_file_of_another_form_is_named(tmp_path: Path, name: str, text: Any, words: str) -> None:
     folder = write_training(tmp_path, "framesamp_modul", 0, 3)
     file = folder / name
     if isinstance(text, dict):
@@ -433,6 +424,14 @@ def test_a_file_of_another_form_or_budget_is_named(
         text = json.dumps({**before, **text})
     file.write_text(text)
     with pytest.raises(UserError, match=words):
+        read_training(folder)
+
+
+def test_a_row_has_the_budget_of_its_name(tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "framesamp_modul@64", 0, 3)
+    read_training(folder)
+    (folder / "config.yaml").write_text("memory: {budget: 32}")
+    with pytest.raises(UserError, match=r"has 64 memory tokens by its name, but 32 in config.yaml"):
         read_training(folder)
 
 

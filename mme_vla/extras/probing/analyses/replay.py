@@ -179,7 +179,7 @@ def selection_sheets(
 ) -> Iterator[tuple[int, Image.Image]]:
     """Draw what `memory` remembers at the first execution step and at every `every`-th after it.
 
-    Selections need no weights: no tokens are stored.
+    Selections need no weights: tokens are zeros, and reading them is an error.
 
     Yields:
         (step, image); images grow with what is remembered.
