@@ -225,13 +225,19 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         """Frames of an episode at which the robot decides, without those that lack a full chunk
         where that counts.
         """
-        decisions = self.sources[source].decisions(episode)
+        opened = self.sources[source]
+        decisions = opened.decisions(episode)
         if not self.processor.samples.full_chunks_only:
             return decisions
         horizon = self.processor.embodiment.action.horizon
-        if self.sources[source].robot.action.frames is None:  # a motion for each decision
-            return decisions[: max(len(decisions) - horizon + 1, 0)]
-        last = int(self.sources[source].lengths[episode]) - horizon - self.action_offset
+        if opened.robot.action.frames is None:
+            # Not every motion has a decision here: some may not have been rendered.
+            full = []
+            for frame in decisions:
+                if opened.action_chunk(episode, int(frame), horizon)[1].all():
+                    full.append(frame)
+            return full
+        last = int(opened.lengths[episode]) - horizon - self.action_offset
         return decisions[: bisect_right(decisions, last)]
 
     def set_epoch(self, epoch: int) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from helpers.h5_files import Recorded, write_file
+from helpers.h5_files import Recorded, robomme_robot, write_file
 from helpers.memory_fakes import LastFrames, encode, same
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.cache import VisionCache
@@ -264,4 +264,26 @@ def test_full_chunks_alone_are_full_whatever_the_offset(data, processor, monkeyp
     steps = [dataset.step(index) for index in range(len(dataset))]
     # Of 30 frames, six of them of the video; the other episodes are shorter than a chunk.
     assert [step.index for step in steps] == list(range(6, 30 - 20 - offset + 1))
+    assert all(step.recorded.all() for step in steps)
+
+
+def test_full_chunks_of_motions_count_motions_not_the_decisions_that_were_rendered(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """Recorded at every second decision, an episode keeps the motions of them all."""
+    path = tmp_path / "record_dataset_Alpha.h5"
+    write_file(path, [40], poses=True)
+    convert(list_episodes([path]), tmp_path / "Alpha", PNG)
+    robot = robomme_robot("robomme_waypoint", "embodiment.action.horizon=4")
+    source = EpisodeSource(tmp_path / "Alpha", robot=robot)
+    everywhere = source.decisions(0).tolist()
+    stats = compute_norm_stats([source], horizon=4, robot=robot)
+    processor = Processor(28, Tokenizer.load("sample"), stats=stats, embodiment=robot)
+    rendered = np.isin(np.arange(40), everywhere[::2])
+    monkeypatch.setattr(source, "_rendered", dict.fromkeys(source.columns, rendered))
+    monkeypatch.setattr(Processor, "samples", SampleSpec(full_chunks_only=True))
+    data = TrainingDataset([source], processor)
+    steps = [data.step(index) for index in range(len(data))]
+    full = everywhere[: len(everywhere) - 3]
+    assert [step.index for step in steps] == full[::2] and len(full) < len(everywhere)
     assert all(step.recorded.all() for step in steps)
