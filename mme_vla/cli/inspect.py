@@ -23,7 +23,7 @@ from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource, check_episode
 from mme_vla.data.lerobot_files import SAMPLE, find_columns, read_info, resolve_root
 from mme_vla.data.memory_image import memory_sheet
-from mme_vla.data.recording import Recording
+from mme_vla.data.recording import Recording, action_offset_of
 from mme_vla.data.robot_draft import CHECK, draft_robot, save_draft
 from mme_vla.data.sources import default_val_episodes, held_out_in, listed_sources
 from mme_vla.data.statistics import normalised_states
@@ -179,7 +179,8 @@ def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
         kind = ""
     elif held_out is not None:
         kind = "held-out" if held_out[episode] else "training"
-    offset = 0 if data is None else data[0].action_offset
+    # The training state tells it of checkpoints of versions whose configuration did not.
+    offset = action_offset_of(policy) if data is None else data[0].action_offset
     recording = Recording(source, episode, offset)
     title = f"{kind} {recording.described}".strip()
     total = len(decisions_of(recording, policy.embodiment.action.execute, inspection.chunks))
@@ -354,6 +355,8 @@ def training_rows(
         steps = f"{state['step']:,} of {train.get('steps', 0):,} updates"
         steps += f", batches of {train.get('batch_size')}, learning rate {train.get('lr')}"
         steps += f", seed {state['config'].get('seed')}"
+    if action_offset_of(policy):
+        known += f", action_offset={action_offset_of(policy)}"
     error = _summary(card.get("results") or "not recorded")
     rows = [("data", known), ("training", steps), ("error", error)]
     check = _open_loop_of(folder)

@@ -197,6 +197,7 @@ def _train(
         facts={
             "card": {"data": run.data.name, "recipe": recipe(config)},
             TRAINING: identify(config, data.content),
+            "data": {"action_offset": run.data.action_offset},
         },
         name=run.name,
     )

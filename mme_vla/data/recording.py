@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
+from mme_vla.policy.sections import PolicySections
 
 SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
 
@@ -150,6 +151,16 @@ class Recording:
             running.observe(views, states, demo, actions)
         else:
             running.observe(views, states, demo, actions, rendered=rendered)
+
+
+def action_offset_of(policy: Policy) -> int:
+    """The `data.action_offset` of a policy's training; 0 where its configuration has none."""
+    offset = PolicySections.of(policy.config).data.get("action_offset", 0)
+    require(
+        type(offset) is int and 0 <= offset <= 1,
+        f"The policy's configuration has data.action_offset={brief(offset)}; expected 0 or 1.",
+    )
+    return int(offset)
 
 
 def stored_frames(policy: Policy, length: int) -> np.ndarray | None:

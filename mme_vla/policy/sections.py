@@ -18,6 +18,7 @@ class PolicySections:
     token_budget: most tokens of memory and subgoal together.
     adapters: LoRA adapters that the weights have.
     training: the training that the weights are of.
+    data: how it read recordings: `action_offset`.
     card: texts for the model card.
     """
 
@@ -33,6 +34,7 @@ class PolicySections:
     token_budget: int | None = None
     adapters: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
+    data: Mapping[str, Any] = field(default_factory=dict)
     card: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod

@@ -8,10 +8,11 @@ from PIL import Image
 from rich.console import Console
 
 from helpers.lerobot_tables import write_dataset
-from mme_vla import UserError, build_policy
+from mme_vla import Policy, UserError, build_policy
 from mme_vla.cli.inspect import (
     Inspection,
     build_memory,
+    check_open_loop,
     check_place,
     draw_memory,
     held_out_episodes,
@@ -23,9 +24,10 @@ from mme_vla.cli.inspect import (
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.recording import action_offset_of
 from mme_vla.policy.saving import save_policy
 from mme_vla.policy.self_check import NO_CHECK, record_self_check
-from mme_vla.testing.small import unit_stats
+from mme_vla.testing.small import small_policy, unit_stats
 from mme_vla.training.settings import DataSettings, TrainRun
 
 
@@ -203,6 +205,36 @@ def test_draft_trains_and_the_checkpoint_is_checked_open_loop(
         main(compose("inspect", ["checkpoint=run", "dataset=squid", "step=3"]))
     with pytest.raises(UserError, match="squid has episodes 0 … 1"):
         main(compose("inspect", ["checkpoint=run", "dataset=squid", "episode=2"]))
+
+
+@pytest.mark.slow
+def test_weights_without_their_training_say_which_actions_they_were_paired_with(
+    sample: EpisodeSource, tmp_path: Path, console: Console
+) -> None:
+    words = [
+        "model=pi05", "backbone.depth=1", "backbone.vision.depth=1", "data.action_offset=1",
+        "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "train.steps=1",
+        "train.batch_size=2", "train.workers=0", "train.val_samples=0", "train.open_loop_chunks=0",
+        "train.self_check=false", "train.device=cpu", "logger=none",
+    ]  # fmt: skip
+    run = TrainRun.from_config(resolved(compose("train", words)))
+    Policy.from_pretrained(train(run, tmp_path / "run", 0.0)).save_pretrained(tmp_path / "weights")
+    chosen = [f"checkpoint={tmp_path / 'weights'}", "dataset=sample", f"output={tmp_path}"]
+    inspection = Inspection.from_config(resolved(compose("inspect", [*chosen, "chunks=1"])))
+    result = check_open_loop(inspection, console)
+    step = int(result.steps[0])
+    assert (result.recorded[0] == sample.action_chunk(0, step, 20, 1)[0]).all()
+    show_checkpoint(tmp_path / "weights", console)
+    assert "action_offset=1" in console.export_text()
+
+
+@pytest.mark.parametrize("wrong", [2, True, "1", None])
+def test_a_wrong_action_offset_of_a_checkpoint_is_refused(wrong: object) -> None:
+    policy = small_policy("pi05")
+    assert action_offset_of(policy) == 0
+    policy.config["data"] = {"action_offset": wrong}
+    with pytest.raises(UserError, match=r"data\.action_offset=.*; expected 0 or 1"):
+        action_offset_of(policy)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from mme_vla.cli.command import log_to_terminal
 from mme_vla.cli.loading import PolicyChoice, load_policy, release
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
+from mme_vla.data.recording import action_offset_of
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
@@ -48,7 +49,8 @@ def main(cfg: DictConfig) -> None:
         folder = Path(str(values["output"])).expanduser()
     recordings = []
     if values["recordings"] is not None:
-        recordings = all_recordings(open_sources(values["recordings"], policy.embodiment))
+        sources = open_sources(values["recordings"], policy.embodiment)
+        recordings = all_recordings(sources, action_offset_of(policy))
     logger.info("%d scenes, %d runs of each at most, into %s", len(jobs), N_RUNS, folder)
     options = RunOptions(source=place)
     try:

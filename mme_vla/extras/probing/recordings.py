@@ -29,9 +29,10 @@ class Recording(recording.Recording):
         return stored_views, dict.fromkeys(stored_views, here - start)
 
 
-def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
-    """Every episode of some datasets."""
+def all_recordings(sources: Sequence[EpisodeSource], action_offset: int = 0) -> list[Recording]:
+    """Every episode of some datasets. action_offset: of the policy that observes them."""
     recordings = []
     for source in sources:
-        recordings += [Recording(source, episode) for episode in range(len(source))]
+        for episode in range(len(source)):
+            recordings.append(Recording(source, episode, action_offset))
     return recordings

@@ -11,6 +11,7 @@ from typing import Any
 
 from mme_vla.config.sections import read_section
 from mme_vla.data.console import progress
+from mme_vla.data.recording import action_offset_of
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
@@ -281,7 +282,8 @@ def probe(
     loaded, source = load(policy)
     recorded: list[Recording] = []
     if recordings is not None:
-        recorded = all_recordings(open_sources(recordings, loaded.embodiment))
+        sources = open_sources(recordings, loaded.embodiment)
+        recorded = all_recordings(sources, action_offset_of(loaded))
     jobs: list[Job] = []
     if tasks is not None:
         jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)

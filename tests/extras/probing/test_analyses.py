@@ -129,6 +129,18 @@ def test_a_replay_shows_every_frame_once() -> None:
         next(replay(policy, source, 1))
 
 
+@pytest.mark.parametrize("offset", [0, 1])
+def test_a_replay_pairs_frames_with_the_actions_that_the_policy_learned(
+    sample: EpisodeSource, offset: int
+) -> None:
+    policy = small_policy("pi05_past_actions")
+    policy.config["data"] = {"action_offset": offset}
+    read = policy.require_processor().prompt_spec.past_actions
+    for step, running in replay(policy, sample, 0, most=3):
+        expected = sample.past_actions(0, step, read, offset)
+        np.testing.assert_array_equal(running._executed, expected)
+
+
 def test_ttt_learns_from_each_frame_and_rmt_reports_its_change(sample: EpisodeSource) -> None:
     curves = recurrence_curves(quick_policy("ttt_modul", 8), sample, 1)
     before, after = curves.curves["inner_loss_before"], curves.curves["inner_loss_after"]

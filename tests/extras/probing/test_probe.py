@@ -14,6 +14,7 @@ from helpers.rollout_fakes import quick_policy
 from mme_vla import probe
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
+from mme_vla.extras.probing import run as run_module
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.findings import Findings
@@ -21,6 +22,7 @@ from mme_vla.extras.probing.interventions import NoDemo
 from mme_vla.extras.probing.lines import EntryLine, MomentLine, append, read
 from mme_vla.extras.probing.offline import compare_chunks
 from mme_vla.extras.probing.probed import ProbedPolicy
+from mme_vla.extras.probing.run import ProbePlan
 from mme_vla.extras.probing.settings import ProbeChoice
 from mme_vla.memory.perturbation import Pause, Perturbation
 from mme_vla.policy.build import policy_config
@@ -259,6 +261,17 @@ def test_settings_of_recordings_and_rollouts_are_keywords(tmp_path: Path) -> Non
     assert "shuffle" in page.read_text()
     with pytest.raises(UserError, match="Unknown key moment"):
         probe(policy, "sample", ["shuffle"], output=tmp_path, moment=1)
+
+
+def test_recordings_are_read_as_the_policy_was_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = small_policy("framesamp_modul")
+    policy.config["data"] = {"action_offset": 1}
+    plans: list[ProbePlan] = []
+    monkeypatch.setattr(run_module, "run_probe", lambda _, plan, *rest: plans.append(plan))
+    probe(policy, "sample", ["shuffle"], output=tmp_path)
+    assert {recording.action_offset for recording in plans[0].recordings} == {1}
 
 
 def test_names_of_a_checkpoints_plugins_are_checked_once_the_plugins_are_imported() -> None:

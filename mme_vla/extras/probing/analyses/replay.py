@@ -11,6 +11,7 @@ from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource, check_episode
 from mme_vla.data.memory_image import memory_sheet
+from mme_vla.data.recording import action_offset_of
 from mme_vla.data.statistics import compute_norm_stats, normalised_states
 from mme_vla.errors import UserError, require
 from mme_vla.extras.probing.recordings import Recording
@@ -53,7 +54,7 @@ def replay(
         processor.stats = compute_norm_stats(
             [source], horizon=processor.embodiment.action.horizon, robot=processor.embodiment
         )
-    recording = Recording(source, episode)
+    recording = Recording(source, episode, action_offset_of(policy))
     n_observed = 0
     text = SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text)
     running = policy.start_episode(recording.goal)

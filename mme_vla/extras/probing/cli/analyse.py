@@ -383,7 +383,7 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
         ),
         "This analysis",
     )
-    return policy, EpisodeSource(args.dataset), args.model
+    return policy, EpisodeSource(args.dataset, robot=policy.embodiment), args.model
 
 
 def _paper(table: str, model: str) -> dict[str, str]:

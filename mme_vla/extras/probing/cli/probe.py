@@ -26,6 +26,7 @@ def probe(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
     from mme_vla.cli.evaluate import choose_subgoals, report_usage
     from mme_vla.cli.loading import PolicyChoice, load_policy, release
+    from mme_vla.data.recording import action_offset_of
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_numbers, named_tasks
@@ -68,7 +69,8 @@ def probe(cfg: DictConfig) -> None:
     policy, name, source = load_policy(PolicyChoice.from_config(values), "probe", logger, device)
     recordings = []
     if choice.recordings is not None:
-        recordings = all_recordings(open_sources(choice.recordings, policy.embodiment))
+        sources = open_sources(choice.recordings, policy.embodiment)
+        recordings = all_recordings(sources, action_offset_of(policy))
     probed = []
     if choice.on_recordings:
         numbers = choose_numbers(values["recorded"], len(recordings), "the data")

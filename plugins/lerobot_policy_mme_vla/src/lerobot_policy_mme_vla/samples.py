@@ -14,6 +14,7 @@ from torch import Tensor, distributed
 
 from mme_vla import Policy
 from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.recording import action_offset_of
 from mme_vla.errors import UserError
 from mme_vla.training.data import prepare_data
 from mme_vla.training.settings import DataSettings
@@ -88,7 +89,7 @@ def _steps(model: Policy, config: "MMEVLAConfig", entry: dict[str, Any]) -> Trai
         "sources": [entry],
         "val_fraction": 0.0,
         "val_episodes": [],
-        "action_offset": 0,
+        "action_offset": action_offset_of(model),
         "mask_padding": False,
         "jitter": False,
         "cache": {
