@@ -212,7 +212,8 @@ def data_of(checkpoint: Path) -> tuple[DataSettings, list[str]] | None:
     if not isinstance(section, Mapping):
         return None
     content = section.get("content") or []
-    return DataSettings.from_dict(without(section, "content")), [str(text) for text in content]
+    settings = DataSettings.from_dict(without(section, "content", "side_files"))
+    return settings, [str(text) for text in content]
 
 
 def held_out_episodes(

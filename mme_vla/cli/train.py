@@ -184,7 +184,8 @@ def _train(
     data = open_data(policy, run, place, accelerator, has_weights, line)
     check_disk(place.folder, policy, run.train.keep, sharded)
     config = config_of(run, place)
-    saved_config = {**config, "data": {**config["data"], "content": data.content}}
+    digests = {"content": data.content, "side_files": data.side_files}
+    saved_config = {**config, "data": {**config["data"], **digests}}
     trainer = Trainer(
         policy,
         data.train,
@@ -196,7 +197,7 @@ def _train(
         accelerator,
         facts={
             "card": {"data": run.data.name, "recipe": recipe(config)},
-            TRAINING: identify(config, data.content),
+            TRAINING: identify(config, data.content, data.side_files),
             "data": {"action_offset": run.data.action_offset},
         },
         name=run.name,
@@ -289,7 +290,7 @@ def open_data(
             policy, run.data, run.seed, place.checkpoint, shlex.join(words), line.say, encoder[0]
         )
     if place.checkpoint is not None:
-        check_content(place.checkpoint, data.content)
+        check_content(place.checkpoint, data.content, data.side_files)
     return data
 
 

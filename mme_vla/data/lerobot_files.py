@@ -386,7 +386,9 @@ def content_fingerprint(
         place = root / part
         files = [place] if place.is_file() else sorted(place.rglob("*"))
         for file in files:
-            if file.suffix not in (".parquet", ".mp4") or file.name.startswith(_HIDDEN):
+            if file != place and file.suffix not in (".parquet", ".mp4"):
+                continue
+            if file.name.startswith(_HIDDEN):
                 continue
             name = file.relative_to(root).as_posix()
             size = require_file(inside(root, name), "a part of a dataset").stat().st_size

@@ -58,13 +58,18 @@ class TrainingIdentity:
     weights: str | None = None
 
 
-def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any]:
+def identify(
+    config: Mapping[str, Any],
+    content: Sequence[str],
+    side_files: Sequence[Mapping[str, str]] = (),
+) -> dict[str, Any]:
     """The identity of a training before it has weights, as plain values for the policy's
     configuration.
 
     Args:
         config: the plain configuration of a training.
         content: fingerprints of its datasets.
+        side_files: digests of what is read beside them, of each dataset.
     """
     train = config.get("train") or {}
     policy = config.get("policy") or {}
@@ -85,11 +90,13 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
         # The weights to start from: their digest, or the end of their path or hub name.
         folder = newest_checkpoint(Path(source).expanduser())
         recipe["init_from"] = weights_digest(folder) or Path(source).name
-    split = {
+    split: dict[str, Any] = {
         "content": list(content),
         "val_fraction": data.get("val_fraction"),
         "val_episodes": data.get("val_episodes"),
     }
+    if any(side_files):
+        split["side_files"] = list(side_files)
     identity = TrainingIdentity(int(config["seed"]), digest(recipe, 12), digest(split, 12))
     return {key: value for key, value in asdict(identity).items() if value is not None}
 

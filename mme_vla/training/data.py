@@ -2,18 +2,28 @@
 place.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mme_vla.config.naming import digest
 from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
+from mme_vla.data.columns import FACT, FACT_VISIBLE
 from mme_vla.data.dataset import ColumnNames, TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.sources import Split, default_val_episodes, open_sources, split_episodes
+from mme_vla.data.lerobot_files import FACTS, SIDE_FILE, content_fingerprint
+from mme_vla.data.sources import (
+    Split,
+    default_val_episodes,
+    listed_sources,
+    open_sources,
+    split_episodes,
+)
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
 from mme_vla.errors import UserError, counted, require
 from mme_vla.memory.perturbation import build_transforms
@@ -22,7 +32,7 @@ from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
-from mme_vla.registry import TRAINING_SETS
+from mme_vla.registry import SIDE_FILES, TRAINING_SETS
 from mme_vla.training.settings import DataSettings
 from mme_vla.types import labels_read
 from mme_vla.utils import checked_file
@@ -40,6 +50,8 @@ class SplitData:
     val: Any | None
     content: list[str]
     """A fingerprint of each dataset's content."""
+    side_files: list[dict[str, str]]
+    """Of each dataset: digests of the files beside its content that the samples follow from."""
 
 
 def prepare_data(
@@ -103,13 +115,41 @@ def prepare_data(
     val = None
     if held_out:
         val = _samples(policy, data, sources, caches, split.val, seed, held_out=True)
-    names = ", ".join(source.name for source in sources)
+    listed_names = ", ".join(source.name for source in sources)
     say(
-        f"data {names}: {counted(len(train), 'training step')} in"
+        f"data {listed_names}: {counted(len(train), 'training step')} in"
         f" {counted(sum(map(len, split.train)), 'episode')},"
         f" {counted(0 if val is None else len(val), 'held-out step')} in {held_out}"
     )
-    return SplitData(train, val, [source.fingerprint for source in sources])
+    names = {*labels_read(*policy.modules()), data.weights}
+    side_files = []
+    for entry, source in zip(listed_sources(data.sources), sources, strict=True):
+        is_marked = entry.exec_starts is None
+        side_files.append(_side_files(source, is_marked, names, processor.samples.kind))
+    return SplitData(train, val, [source.fingerprint for source in sources], side_files)
+
+
+def _side_files(
+    source: EpisodeSource, is_marked: bool, names: Collection[str | None], kind: str
+) -> dict[str, str]:
+    """Digests of the files beside a dataset's content that training samples follow from.
+
+    is_marked: the tables say where execution begins.
+    names: labels and weights that are read.
+    kind: of the samples.
+    """
+    digests = {}
+    if not is_marked:
+        digests["exec_starts"] = sha256(source.exec_starts.tobytes()).hexdigest()[:16]
+    if FACT in names or FACT_VISIBLE in names:
+        digests[FACTS] = sha256((source.root / FACTS).read_bytes()).hexdigest()[:16]
+    if source.robot.action.choice or kind in SIDE_FILES:
+        digests[SIDE_FILE] = digest({"episodes": source.records}, 16)
+    if kind in SIDE_FILES:
+        files = [SIDE_FILES[kind].file_of(source.root, episode) for episode in range(len(source))]
+        parts = [file.relative_to(source.root).as_posix() for file in files]
+        digests[kind] = content_fingerprint(source.root, parts)
+    return digests
 
 
 def compute_statistics(

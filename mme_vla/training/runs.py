@@ -50,15 +50,16 @@ MAY_DIFFER = (
     "train.device",
     "data.cache",
     "data.content",
+    "data.side_files",
     "data.narrow_ranges",
     "trust_plugins",
 )
 """Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that
 changes a loss.
 
-The name is a label alone. `data.content`, the fingerprints of the datasets, is compared when they
-are open (`check_content`). A run's statistics stay what they are: `data.narrow_ranges` decides only
-whether it continues with narrow ones.
+The name is a label alone. `data.content` and `data.side_files`, digests of the datasets, are
+compared when they are open (`check_content`). A run's statistics stay what they are:
+`data.narrow_ranges` decides only whether it continues with narrow ones.
 """
 
 
@@ -177,21 +178,29 @@ def check_settings(checkpoint: Path, then: Mapping[str, Any], now: Mapping[str, 
     )
 
 
-def check_content(checkpoint: Path, now: Sequence[str]) -> None:
+def check_content(
+    checkpoint: Path, content: Sequence[str], side_files: Sequence[Mapping[str, str]] = ()
+) -> None:
     """Make sure that a resumed run has the data it began with.
 
     Args:
         checkpoint: it continues from.
-        now: `SplitData.content`.
+        content, side_files: of `SplitData`.
     """
-    then = read_state(checkpoint)["config"].get("data", {}).get("content")
-    if then is not None and list(then) != list(now):
+    names = sorted({name for files in side_files for name in files})
+    data = read_state(checkpoint)["config"].get("data", {})
+    for key, now, changed in (
+        ("content", content, "holds other episodes"),
+        ("side_files", side_files, f"has another {' or '.join(names) or 'side file'}"),
+    ):
+        then = data.get(key)  # earlier versions kept no side files
+        if then is None or list(then) == list(now):
+            continue
         which = [i for i, (old, new) in enumerate(zip_longest(then, now)) if old != new]
         raise UserError(
             f"The data have changed since {checkpoint} was written: number"
-            f" {', '.join(map(str, which))} of data.sources holds other episodes, so continuing"
-            " would be another run. Bring the data back, or start anew with"
-            f" init_from={checkpoint}."
+            f" {', '.join(map(str, which))} of data.sources {changed}, so continuing would be"
+            f" another run. Bring the data back, or start anew with init_from={checkpoint}."
         )
 
 

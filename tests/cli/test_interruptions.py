@@ -219,6 +219,13 @@ def test_training_data_that_changed_are_noticed(tmp_path: Path) -> None:
     check_content(checkpoint, ["a", "b"])
     with pytest.raises(UserError, match=r"number 1 of data\.sources"):
         check_content(checkpoint, ["a", "c"])
+    of_facts = {"meta/facts.csv": "1"}
+    check_content(checkpoint, ["a", "b"], [{}, of_facts])  # of an earlier version
+    state["config"]["data"]["side_files"] = [{}, of_facts]
+    write_json(checkpoint / "training_state.json", state)
+    check_content(checkpoint, ["a", "b"], [{}, of_facts])
+    with pytest.raises(UserError, match=r"number 1 of data\.sources has another meta/facts\.csv"):
+        check_content(checkpoint, ["a", "b"], [{}, {"meta/facts.csv": "2"}])
     assert "data.content" in MAY_DIFFER, "it is compared when the data are open, not before"
 
 

@@ -31,7 +31,7 @@ from mme_vla.data.lerobot_files import FACTS, SAMPLE
 from mme_vla.envs.facts import Fact, write_facts
 from mme_vla.memory.base import stack_history
 from mme_vla.testing.small import open_gates, random_batch, small_policy, unit_stats
-from mme_vla.training.data import prepare_data
+from mme_vla.training.data import SplitData, prepare_data
 from mme_vla.training.settings import DataSettings, TrainSettings
 from mme_vla.types import Batch, Labels, ReadsLabels
 
@@ -67,7 +67,7 @@ def loss_of(
     return loss.detach(), metrics
 
 
-def prepared(policy: MMEPolicy, folder: Path, **options: object) -> TrainingDataset:
+def split(policy: MMEPolicy, folder: Path, **options: object) -> SplitData:
     data = {
         "name": "sample",
         "sources": ["sample"],
@@ -79,7 +79,11 @@ def prepared(policy: MMEPolicy, folder: Path, **options: object) -> TrainingData
         "cache": {"root": str(folder), "batch_size": 32, "max_build_frames": 5000},
         **options,
     }
-    dataset = prepare_data(policy, DataSettings.from_dict(data), 0, say=lambda line: None).train
+    return prepare_data(policy, DataSettings.from_dict(data), 0, say=lambda line: None)
+
+
+def prepared(policy: MMEPolicy, folder: Path, **options: object) -> TrainingDataset:
+    dataset = split(policy, folder, **options).train
     assert isinstance(dataset, TrainingDataset)
     return dataset
 
@@ -223,6 +227,28 @@ def test_keyframes_learn_from_facts(tmp_path: Path) -> None:
     batch = policy.require_processor().collate([item])
     noise = policy.training_noise(1, torch.Generator().manual_seed(0))
     assert policy.train()(batch, noise)[1]["losses/write"] > 0
+
+
+def test_side_files_that_are_read_count_as_data_and_no_others(tmp_path: Path) -> None:
+    root = sample_with(tmp_path, (0, Fact("light", "red", (20, 30), (40,))))
+    starts = tmp_path / "starts.json"
+    given = EpisodeSource(root).exec_starts.tolist()
+    starts.write_text(json.dumps(dict(enumerate(given))))
+    entry = {"root": str(root), "exec_starts": str(starts)}
+    blind = small_policy("framesamp_modul", memory={"budget": 64})
+    counting = small_policy("keyframes_modul", memory={"label": FACT, "budget": 64})
+    assert split(blind, tmp_path, sources=[str(root)]).side_files == [{}]
+    before = split(counting, tmp_path, sources=[entry])
+    assert before.side_files[0].keys() == {FACTS, "exec_starts"}
+    weighed = split(blind, tmp_path, sources=[str(root)], weights=FACT_VISIBLE)
+    assert weighed.side_files == [{FACTS: before.side_files[0][FACTS]}]
+
+    text = (root / FACTS).read_text()
+    (root / FACTS).write_text(text.replace("20", "21"))
+    after = split(counting, tmp_path, sources=[entry])
+    assert after.content == before.content
+    changed = after.side_files[0].items() ^ before.side_files[0].items()
+    assert {name for name, _ in changed} == {FACTS}
 
 
 HEADER, OF_0 = "episode,task,fact,from,to\n", "VideoUnmask,red"

@@ -1,5 +1,6 @@
 """SAM2Act+ as a policy: what it learns, and what an episode remembers."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,15 @@ from helpers.scripted_env import SIZE
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
+from mme_vla.data.lerobot_files import SIDE_FILE
 from mme_vla.errors import UserError
-from mme_vla.extras.methods.sam2act.keyframes import KeyframeDataset
+from mme_vla.extras.methods.sam2act.keyframes import KeyframeDataset, KeyframeFile
 from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.extras.methods.sam2act.processor import KeyframeBatch
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.training.data import prepare_data
+from mme_vla.training.settings import DataSettings
 
 
 def built(**overrides: Any) -> SAM2ActPolicy:
@@ -160,3 +164,24 @@ def test_robots_without_depth_or_with_other_actions_are_refused() -> None:
         built(embodiment="robomme_waypoint")
     with pytest.raises(UserError, match="one planned motion of 7 numbers"):
         built(embodiment={"action": {"horizon": 2}})
+
+
+def test_kept_keyframes_count_as_data_of_a_run(
+    policy: SAM2ActPolicy, data: Path, tmp_path: Path
+) -> None:
+    copied = tmp_path / "data"
+    shutil.copytree(data, copied)
+
+    def side_files() -> dict[str, str]:
+        settings = DataSettings([str(copied)])
+        return prepare_data(policy, settings, 0, say=lambda line: None).side_files[0]
+
+    before = side_files()
+    assert before.keys() == {"keyframes", SIDE_FILE} and side_files() == before
+    path = KeyframeFile.file_of(copied, 0)
+    with np.load(path) as arrays:
+        content = dict(arrays)
+    content["targets"][0, 0] += 1
+    np.savez_compressed(path, **content)
+    after = side_files()
+    assert after["keyframes"] != before["keyframes"] and after[SIDE_FILE] == before[SIDE_FILE]
