@@ -32,7 +32,7 @@ from mme_vla.embodiment.action_space import numbered
 from mme_vla.errors import UserError, counted, printable, require
 from mme_vla.evaluation.records import display_name
 from mme_vla.memory.base import Memory
-from mme_vla.memory.history import OnlineHistory, TokenlessHistory
+from mme_vla.memory.history import History, OnlineHistory, TokenlessHistory
 from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
@@ -85,7 +85,8 @@ class Inspection:
 def main(cfg: DictConfig) -> None:
     """Print what `checkpoint`, `dataset` or `episode` holds, and for an episode draw its memory.
 
-    With `checkpoint` and `dataset` the policy is checked open loop on an episode.
+    With `checkpoint` and `dataset` the policy is checked open loop on an episode; with `step` too,
+    its memory at that step is drawn.
     """
     inspection = Inspection.from_config(policy_config(cfg))
     console = Console(markup=False)
@@ -93,7 +94,10 @@ def main(cfg: DictConfig) -> None:
         show_self_check(inspection, console)
         return
     if inspection.checkpoint is not None and inspection.dataset is not None:
-        check_open_loop(inspection, console)
+        if inspection.step is None:
+            check_open_loop(inspection, console)
+        else:
+            draw_policy_memory(inspection, console)
         return
     if inspection.checkpoint is not None:
         show_checkpoint(
@@ -146,19 +150,12 @@ def show_self_check(inspection: Inspection, console: Console) -> None:
     console.print(result.line, highlight=False, soft_wrap=True)
 
 
-def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
-    """Print and draw predicted against recorded actions along an episode of `dataset`, with the
-    robot and the memory of `checkpoint`.
-    """
+def open_both(inspection: Inspection) -> tuple[Policy, str, EpisodeSource, Path]:
+    """The policy of `checkpoint`, its name, `dataset` of its robot, and the checkpoint's folder."""
     assert inspection.checkpoint is not None and inspection.dataset is not None
     named = words_of("embodiment", "env", "backbone", "memory")
     require(
         not named, f"A checkpoint brings its own robot and memory: leave out {' '.join(named)}."
-    )
-    require(
-        inspection.step is None,
-        "step= chooses the frame at which a memory is rendered: leave it out, or leave out"
-        " checkpoint=.",
     )
     folder = resolve_checkpoint(Path(inspection.checkpoint))
     device = find_device(inspection.device)
@@ -166,6 +163,38 @@ def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
     name = str(PolicySections.of(policy.config).name or "policy")
     name = display_name(name, shipped_name(folder) or str(folder))
     source = EpisodeSource(inspection.dataset, inspection.exec_starts, robot=policy.embodiment)
+    return policy, name, source, folder
+
+
+@torch.no_grad()
+def draw_policy_memory(inspection: Inspection, console: Console) -> Path:
+    """Draw what the memory of `checkpoint` selects at `step` of an episode of `dataset`."""
+    episode = inspection.episode
+    if episode is None:
+        raise UserError(
+            f"step={inspection.step} draws the memory of a checkpoint at that frame of an episode:"
+            " add episode=…, or leave step out to compare actions."
+        )
+    policy, name, source, _ = open_both(inspection)
+    memory = policy.require_memory()
+    episode, step = check_place(source, episode, inspection.step)
+    recording = Recording(source, episode, action_offset_of(policy))
+    running = policy.start_episode(source.goal(episode, step))
+    required = policy.frames_read(np.array([step]), recording.exec_start)
+    recording.show(running, 0, step + 1, required)
+    history = running.required_history()
+    image = draw_memory(
+        source, episode, step, memory, name, Path(inspection.output), console, history
+    )
+    console.print(f"image: {image}", highlight=False, soft_wrap=True)
+    return image
+
+
+def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
+    """Print and draw predicted against recorded actions along an episode of `dataset`, with the
+    robot and the memory of `checkpoint`.
+    """
+    policy, name, source, folder = open_both(inspection)
     data = data_of(folder)
     held_out = None if data is None else held_out_episodes(source, *data)
     episode = inspection.episode
@@ -525,18 +554,23 @@ def draw_memory(
     name: str,
     folder: Path,
     console: Console,
+    history: History | None = None,
 ) -> Path:
-    """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
+    """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers.
+
+    history: the episode so far, of a policy; None for a memory alone, without tokens.
+    """
     frames = source.frames(episode, np.arange(step + 1))
     start = int(source.exec_starts[episode])
-    history = OnlineHistory(memory.storage, memory.make_scorer(), start)
-    stored = history.to_encode(len(frames))
-    patches = memory.storage.grid**2
-    history.append(frames, torch.zeros(len(stored), patches, 1))
-    motion = normalised_states(source.states(episode, 0, step + 1))
-    history.motion = motion.__getitem__
-    history.state_width = motion.shape[1]
-    selected = memory.select(TokenlessHistory(history), step)
+    stored = memory.storage.stored_frames(len(frames))
+    if history is None:
+        filled = OnlineHistory(memory.storage, memory.make_scorer(), start)
+        filled.append(frames, torch.zeros(len(stored), memory.storage.grid**2, 1))
+        motion = normalised_states(source.states(episode, 0, step + 1))
+        filled.motion = motion.__getitem__
+        filled.state_width = motion.shape[1]
+        history = TokenlessHistory(filled)
+    selected = memory.select(history, step)
     remembered = np.unique(selected[:, 0])
     table = _table(f"{name} at step {step}", "", "")
     table.add_row(

@@ -424,8 +424,9 @@ class TokenlessHistory(DerivedHistory):
     def gather(self, indices: np.ndarray) -> Tensor:
         raise TokensReadError(
             "This memory reads vision tokens to choose its frames, and a memory alone has none. A"
-            " trained policy has them: `mme-vla analyse writing --checkpoint FOLDER` scores what it"
-            " keeps."
+            " trained policy has them: `mme-vla inspect checkpoint=… dataset=… episode=… step=…`"
+            " draws what it chooses, and `mme-vla analyse writing --checkpoint FOLDER` scores what"
+            " it keeps."
         )
 
 

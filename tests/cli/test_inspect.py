@@ -3,7 +3,9 @@
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image
 from rich.console import Console
 
@@ -24,7 +26,7 @@ from mme_vla.cli.inspect import (
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.recording import action_offset_of
+from mme_vla.data.recording import Recording, action_offset_of
 from mme_vla.policy.saving import save_policy
 from mme_vla.policy.self_check import NO_CHECK, record_self_check
 from mme_vla.testing.small import small_policy, unit_stats
@@ -73,6 +75,35 @@ def test_a_memory_that_chooses_by_tokens_is_not_rendered(
     memory = build_memory(Inspection.from_config(config))
     with pytest.raises(UserError, match="reads vision tokens to choose its frames"):
         draw_memory(sample, 0, 170, memory, "retrieval", tmp_path, console)
+
+
+@pytest.mark.parametrize("name", ["framesamp_modul", "retrieval_modul"])
+def test_the_memory_of_a_checkpoint_is_rendered_with_the_tokens_that_it_reads(
+    name: str, sample: EpisodeSource, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = small_policy(name)
+    policy.save_pretrained(tmp_path / "policy")
+    chosen = [f"checkpoint={tmp_path / 'policy'}", "dataset=sample", f"output={tmp_path}"]
+    main(compose("inspect", [*chosen, "episode=1", "step=100"]))
+    running = policy.start_episode(sample.goal(1))
+    Recording(sample, 1).show(running, 0, 101)
+    with torch.no_grad():
+        selected = policy.require_memory().select(running.required_history(), 100)
+    frames = ", ".join(str(frame) for frame in np.unique(selected[:, 0]))
+    printed = "".join(character for character in capsys.readouterr().out if character not in "│\n")
+    assert " ".join(frames.split()) in " ".join(printed.split())
+    (path,) = tmp_path.glob("sample_episode1_step100_*.png")
+    with Image.open(path) as image:
+        assert image.width > 800
+
+
+def test_a_checkpoint_without_memory_has_none_to_render(tmp_path: Path) -> None:
+    small_policy("pi05").save_pretrained(tmp_path)
+    words = [f"checkpoint={tmp_path}", "dataset=sample", "step=3"]
+    with pytest.raises(UserError, match=r"add episode=…"):
+        main(compose("inspect", words))
+    with pytest.raises(UserError, match="has no memory"):
+        main(compose("inspect", [*words, "episode=0"]))
 
 
 def test_the_tokens_that_are_read_are_counted_against_the_most_that_can_be(
@@ -201,7 +232,7 @@ def test_draft_trains_and_the_checkpoint_is_checked_open_loop(
     assert "squid: cameras top" in printed and "1 of 1 updates" in printed
     assert "held-out episode 1 of squid" in printed, "the check at the end of training"
 
-    with pytest.raises(UserError, match="step= chooses"):
+    with pytest.raises(UserError, match=r"step=3 draws .* add episode="):
         main(compose("inspect", ["checkpoint=run", "dataset=squid", "step=3"]))
     with pytest.raises(UserError, match="squid has episodes 0 … 1"):
         main(compose("inspect", ["checkpoint=run", "dataset=squid", "episode=2"]))
