@@ -143,6 +143,14 @@ def extensions() -> tuple[Extension, ...]:
     return extras() + installed_extensions()
 
 
+KEPT_OPTIONS = {
+    key: "An option that you did not set is of the section's file: another name keeps it. Choose a"
+    f" file with {key}=…, which brings its own options, or remove an option with ~{key}.<option>."
+    for key in ("memory", "integration", "backbone", "subgoal")
+}
+"""What to do about options that another class of a section leaves over, by the section's key."""
+
+
 class Registry[T]:
     """A table of constructors under short names.
 
@@ -296,6 +304,8 @@ class Registry[T]:
         for option in options:
             if option not in known:
                 hint = did_you_mean(option, known)
+                if self.key in KEPT_OPTIONS:
+                    hint += f" {KEPT_OPTIONS[self.key]}"
                 break
         text = ", ".join(f"{option}={brief(value)}" for option, value in options.items())
         return UserError(

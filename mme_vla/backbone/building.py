@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from functools import lru_cache
 from typing import Any
 
@@ -10,7 +11,8 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from mme_vla.backbone.base import Backbone
-from mme_vla.registry import BACKBONES
+from mme_vla.errors import UserError
+from mme_vla.registry import BACKBONES, KEPT_OPTIONS
 
 _INITIALISERS = {Tensor.normal_, Tensor.uniform_}
 
@@ -45,7 +47,13 @@ def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
     from mme_vla.config.sections import read_section, without
 
     kind: type[Backbone] = BACKBONES[str(section.get("name"))]
-    return kind, read_section(kind.Config, without(section, "name"), "backbone")
+    sizes = without(section, "name")
+    try:
+        return kind, read_section(kind.Config, sizes, "backbone")
+    except UserError as error:
+        if sizes.keys() <= {spec.name for spec in fields(kind.Config)}:
+            raise
+        raise UserError(f"{error} {KEPT_OPTIONS['backbone']}") from error
 
 
 def shape_of(section: Mapping[str, Any]) -> Backbone:

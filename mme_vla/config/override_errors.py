@@ -103,7 +103,11 @@ class ConfigTree:
                         key = f"{key}.{name}"
                         break
                 return _unknown_key(key, defaults, ()) + f" To add it: +{key}=…"
-        return _unknown_key(key, defaults, self.loader.list_groups(""))
+        text = _unknown_key(key, defaults, self.loader.list_groups(""))
+        named = f"{key.partition('.')[0]}.name"
+        if any(override.key_or_group == named for override in self.values):
+            text += f" An option of the class that {named} chooses is added with +{key}=…"
+        return text
 
     def check_kinds(self) -> None:
         """Refuse a value of another kind than the default: text for a number, a value for a

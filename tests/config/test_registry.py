@@ -6,7 +6,8 @@ import sys
 import pytest
 
 from helpers import REPOSITORY
-from mme_vla import UserError, register
+from mme_vla import UserError, build_policy, register
+from mme_vla.memory.base import Memory
 from mme_vla.registry import REGISTRIES, Registry
 
 
@@ -47,6 +48,35 @@ def test_an_option_that_is_passed_on_is_named_where_no_constructor_takes_it() ->
         parts.build({"name": "named", "gird": 4})
     with pytest.raises(TypeError, match="negative"):
         parts.build({"name": "named", "grid": -1})
+
+
+@pytest.mark.parametrize(
+    ("section", "values"),
+    [
+        ("memory", {"name": "only_budget"}),
+        ("integration", {"name": "context"}),
+        ("backbone", {"name": "nano"}),
+    ],
+)
+def test_options_that_another_name_kept_are_said_to_be_of_the_file(
+    section: str, values: dict[str, object]
+) -> None:
+    if "only_budget" not in REGISTRIES["memory"]:
+
+        @register("memory", "only_budget")
+        class OnlyBudget(Memory):
+            def __init__(self, d_vision: int, width: int, budget: int = 4) -> None:
+                super().__init__()
+
+    with pytest.raises(UserError, match=rf"is of the section's file.* {section}=….*~{section}\."):
+        build_policy("framesamp_modul", device="meta", **{section: values})
+
+
+def test_an_option_of_a_class_that_has_no_file_is_added() -> None:
+    with pytest.raises(UserError, match=r"'memory\.depth'.* is added with \+memory\.depth=…"):
+        build_policy("framesamp_modul", memory={"name": "only_budget", "depth": 3})
+    with pytest.raises(UserError, match="Unknown memory 'absent'"):
+        build_policy("framesamp_modul", memory={"name": "absent"}, **{"+memory.depth": 3})
 
 
 @pytest.mark.parametrize("section", [[["name", "dot"]], ["name"], "dot", 3, None])
