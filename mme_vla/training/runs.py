@@ -163,6 +163,9 @@ def check_settings(checkpoint: Path, then: Mapping[str, Any], now: Mapping[str, 
     changed = differing_keys(then, now)
     if not changed:
         return
+    if then.get("name") != now.get("name"):
+        # A label alone, but most often the reason of all the others: model=… was left out.
+        changed = {"name": (then.get("name"), now.get("name")), **changed}
     lines = []
     for key, (old, new) in changed.items():
         lines.append(f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now")

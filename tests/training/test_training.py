@@ -148,6 +148,9 @@ def test_resuming_with_other_settings_lists_them(two_steps: Path, tmp_path: Path
     assert "seed: 1 then, 2 now" in str(error.value)
     assert "train.steps" not in str(error.value).replace("train.steps=", "")
     assert "log_every" not in str(error.value)
+    assert "name:" not in str(error.value)
+    with pytest.raises(UserError, match=r"another run:\n  name: None then, 'pi05' now\n  seed:"):
+        open_run(tmp_path / "new", str(two_steps), {"train": RECIPE, "seed": 2, "name": "pi05"})
     run = open_run(tmp_path / "new", str(two_steps), {"train": {**RECIPE, "steps": 9}, "seed": 1})
     assert (run.folder, run.step) == (two_steps, 2)
     with pytest.raises(UserError, match=r"has done 2 steps already, more than train\.steps=1"):
