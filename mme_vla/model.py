@@ -134,7 +134,7 @@ class MMEModel(nn.Module):
             return None
         with self.autocast():
             history = self.memory.condition_on_prompt(batch.history, self.prompt_condition(batch))
-            return self.memory(history)
+            return self.memory.tokens_of(history)
 
     def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
         """The observation's blocks with memory added. The batch's images are prepared.

@@ -121,6 +121,21 @@ class MemoryModule(nn.Module):
         """
         raise NotImplementedError
 
+    def tokens_of(self, history: HistoryTokens) -> MemoryTokens:
+        """What `forward` returns.
+
+        Raises:
+            UserError: it is no `MemoryTokens`.
+        """
+        tokens: MemoryTokens = self(history)
+        require(
+            isinstance(tokens, MemoryTokens),
+            f"{type(self).__name__}.forward returned {type(tokens).__name__}; expected"
+            " mme_vla.MemoryTokens(tokens, mask), [b, n, d] and bool [b, n] with n of at most"
+            f" budget={self.budget}.",
+        )
+        return tokens
+
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         """Frames that `select`, the scorer or the backbone may read at these steps.
 
@@ -189,8 +204,7 @@ class MemoryModule(nn.Module):
             streams: their states of `start_stream`, updated in place.
         """
         selections = [self.gather_selection(history, len(history) - 1) for history in histories]
-        tokens: MemoryTokens = self(stack_history(selections))
-        return tokens
+        return self.tokens_of(stack_history(selections))
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Do a part of the work of the next `encode` while the robot moves. It must not change any

@@ -140,7 +140,7 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         outputs: dict[int, MemoryTokens] = {}
         for i, selection in self._split(history):
             memories[i].reporting = self.reporting
-            outputs[i] = memories[i](selection)
+            outputs[i] = memories[i].tokens_of(selection)
         return self._join([outputs[i] for i in range(len(memories))])
 
     def _split(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:

@@ -154,6 +154,18 @@ def test_more_memory_tokens_than_the_budget_are_refused(policy):
         policy(random_batch(policy))
 
 
+def test_what_is_no_memory_tokens_is_refused_in_training_and_in_an_episode(policy):
+    policy.memory.forward = lambda history: (history.features, history.mask)
+    message = r"LastFrames.forward returned tuple; expected mme_vla.MemoryTokens"
+    with pytest.raises(UserError, match=message):
+        policy(random_batch(policy))
+    episode = policy.start_episode("press the button")
+    frames = moving_frames(8)
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((8, 8)))
+    with pytest.raises(UserError, match=message):
+        policy.act([episode])
+
+
 def test_a_constructor_without_the_widths_is_named(monkeypatch):
     monkeypatch.setattr(MEMORIES, "_entries", dict(MEMORIES._entries))
     register("memory", "mistaken")(lambda budget=16: FrameSamp(32, 48, budget))

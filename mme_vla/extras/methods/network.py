@@ -13,7 +13,7 @@ class MethodPolicy(NetworkPolicy):
         if self.memory is None or history is None:
             return None
         with self.autocast():
-            return self.memory(history)
+            return self.memory.tokens_of(history)
 
 
 def processor_for[P](kind: type[P], processor: object, names: str) -> P | None:
