@@ -9,7 +9,7 @@ only when the environment renders.
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -30,6 +30,7 @@ from mme_vla.envs.observations import (
     frame_keys,
     observation_space,
 )
+from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 from mme_vla.envs.robomme.robot.control import PlanningError
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
@@ -60,37 +61,14 @@ class EpisodeState:
     variables belong to the state as well. A replay without images takes about two milliseconds a
     control step. Can be pickled.
 
-    task, seed, difficulty, recovery, in_view, stress, row: the scene.
-    action_space, max_steps: of the environment.
+    environment: what makes the scene, the action space and the limit, by name.
     options: of the reset.
     actions: all that were given to `step` since.
     """
 
-    task: str
-    seed: int
-    difficulty: str
-    recovery: str | None
-    in_view: bool
-    stress: dict[str, int]
-    row: Mapping[str, Any] | None
-    action_space: str
-    max_steps: int
+    environment: Mapping[str, Any]
     options: dict[str, Any]
-    actions: tuple[Any, ...]
-
-    def check(self, other: "EpisodeState") -> None:
-        """Make sure that an environment whose own state is `other` can continue from here."""
-        differences = []
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            present = getattr(other, entry.name)
-            if entry.name not in ("options", "actions") and value != present:
-                differences.append(f"{entry.name} {value!r} (here {present!r})")
-        require(
-            not differences,
-            f"This state is of another environment: {', '.join(differences)}. Make one of the same"
-            " episode.",
-        )
+    actions: Sequence[Any]
 
 
 @dataclass
@@ -277,23 +255,22 @@ class RoboMMEEnv(gymnasium.Env):
     def save_state(self) -> EpisodeState:
         """The state of the running episode, for `restore_state`; costs next to nothing."""
         run = self._require_run()
-        return self._state(run.options, run.actions)
+        return EpisodeState(self._described(), run.options, tuple(run.actions))
 
-    def _state(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
+    def _described(self) -> dict[str, Any]:
+        """What an environment must have in common with another one to continue its episodes."""
         task = self.task
-        return EpisodeState(
-            task=type(task).__name__,
-            seed=task.seed,
-            difficulty=task.difficulty,
-            recovery=task.recovery,
-            in_view=task.in_view,
-            stress=task.stress,
-            row=task.row,
-            action_space=self._space.name,
-            max_steps=self.max_steps,
-            options=options,
-            actions=tuple(actions),
-        )
+        return {
+            "task": type(task).__name__,
+            "seed": task.seed,
+            "difficulty": task.difficulty,
+            "recovery": task.recovery,
+            "in_view": task.in_view,
+            "stress": task.stress,
+            "row": task.row,
+            "action_space": self._space.name,
+            "max_steps": self.max_steps,
+        }
 
     def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Continue from a saved state of the same episode, which may come from another environment
@@ -306,7 +283,16 @@ class RoboMMEEnv(gymnasium.Env):
             Observation lists and info, as the last `reset` or `step` before `save_state` returned
             them, images of the newest frame alone.
         """
-        state.check(self._state({}, ()))
+        differences = []
+        for name, present in self._described().items():
+            value = state.environment[name]
+            if value != present:
+                differences.append(f"{name} {value!r} (here {present!r})")
+        require(
+            not differences,
+            f"This state is of another environment: {', '.join(differences)}. Make one of the same"
+            " episode.",
+        )
         hook = self.on_frame
         request = self.render_request
         grounded = request is None or request.grounded
@@ -382,6 +368,13 @@ class RoboMMEEnv(gymnasium.Env):
         """X and y of the tool, in metres."""
         x, y, _ = self.task.tcp_pose.p.tolist()
         return [x, y]
+
+    def oracle(self) -> Mapping[str, Any] | None:
+        """The choice that the task's script takes next; None where it has none."""
+        try:
+            return oracle_choice(self.task)[0]
+        except OracleStuckError:
+            return None
 
     @property
     def steps_counted(self) -> int:
