@@ -13,13 +13,12 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.processing.normalise import (
+    EPSILON,
     ExactStats,
     NormStats,
     QuantileStats,
     RunningStats,
-    narrow_numbers,
     normalize,
-    widened,
 )
 
 log = logging.getLogger(__name__)
@@ -61,7 +60,6 @@ def compute_norm_stats(
         video: count the conditioning video's steps too.
         narrow: what to do about a number whose range the values leave by far (`check_ranges`).
     """
-    check_choice("narrow", narrow, NARROW)
     # All (source, episode, step) that count [n, 3].
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):
@@ -105,6 +103,8 @@ def compute_norm_stats(
     return check_ranges(stats, sources, episodes, horizon, action_offset, robot, video, narrow)
 
 
+NARROW_RANGES = 100
+"""Ranges q01…q99 beyond which a value says that the range is not that of its number."""
 NARROW = ("refuse", "warn", "widen", "ignore")
 """What can be done about a range that is far too narrow; `ignore` does not look, for policies that
 do not need it.
@@ -146,9 +146,11 @@ def check_ranges(
     state, actions = _extremes(sources, episodes, horizon, action_offset, robot, video)
     names = {"state": sources[0].state_names, "actions": sources[0].robot.action.names}
     changed = {}
-    for kind, ends in (("state", state), ("actions", actions)):
+    for kind, (least, greatest) in (("state", state), ("actions", actions)):
         of = getattr(stats, kind)
-        places = narrow_numbers(of, *ends)
+        reach = np.maximum(of.q01 - least, greatest - of.q99)
+        beyond = reach > NARROW_RANGES * (of.q99 - of.q01 + EPSILON)
+        places = np.flatnonzero(beyond).tolist()
         if kind == "actions":
             places = [place for place in places if place not in robot.action.choice]
         if not places:
@@ -158,13 +160,16 @@ def check_ranges(
             name = names[kind][place] if place < len(names[kind]) else f"number {place + 1}"
             lines.append(
                 f"{name} of the {kind.removesuffix('s')} has q01 {of.q01[place]:.6g} and q99"
-                f" {of.q99[place]:.6g}, but values from {ends[0][place]:.6g} to"
-                f" {ends[1][place]:.6g}"
+                f" {of.q99[place]:.6g}, but values from {least[place]:.6g} to"
+                f" {greatest[place]:.6g}"
             )
         summary = "; ".join(lines)
         if narrow == "widen":
             log.warning("%s. Its range is widened to these values.", summary)
-            changed[kind] = widened(of, places, *ends)
+            low, high = of.q01.copy(), of.q99.copy()
+            low[places] = np.minimum(low[places], least[places])
+            high[places] = np.maximum(high[places], greatest[places])
+            changed[kind] = replace(of, q01=low, q99=high)
             continue
         message = (
             f"{summary}. Normalised by such a range they become numbers in the hundreds to"

@@ -362,32 +362,6 @@ class RunningStats:
         return self._edges[np.arange(len(below)), below.sum(1)]
 
 
-NARROW_RANGES = 100
-"""Ranges q01…q99 beyond which a value says that the range is not that of its number."""
-
-
-def narrow_numbers(stats: QuantileStats, least: np.ndarray, greatest: np.ndarray) -> list[int]:
-    """The numbers whose values lie more than `NARROW_RANGES` ranges q01…q99 below or above it.
-
-    Args:
-        least, greatest: the extremes of the values, [d].
-    """
-    reach = np.maximum(stats.q01 - least, greatest - stats.q99)
-    return np.flatnonzero(reach > NARROW_RANGES * (stats.q99 - stats.q01 + EPSILON)).tolist()
-
-
-def widened(
-    stats: QuantileStats, places: list[int], least: np.ndarray, greatest: np.ndarray
-) -> QuantileStats:
-    """The same statistics, q01 and q99 of these numbers moved out to the extremes [d] of their
-    values.
-    """
-    low, high = stats.q01.copy(), stats.q99.copy()
-    low[places] = np.minimum(low[places], least[places])
-    high[places] = np.maximum(high[places], greatest[places])
-    return replace(stats, q01=low, q99=high)
-
-
 # multiples of the widest range; a broken driver says 1e30, a robot never leaves its joints' limits
 # by that
 REACH = 100
