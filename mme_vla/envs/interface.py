@@ -76,11 +76,13 @@ class _Run:
     """One episode under way."""
 
     control: Control
+    observer: Observer
     facts: TaskFacts
     displayed: "SubTask"
     """Whose text describes the present frame."""
     last_action: np.ndarray
     in_video: bool = True
+    grounding: Grounding = field(default_factory=Grounding)
     frames: list[dict[str, Any]] = field(default_factory=list)
     """Those that the present call returns."""
     newest: dict[str, Any] = field(default_factory=dict)
@@ -154,12 +156,9 @@ class RoboMMEEnv(gymnasium.Env):
         self._keys = frame_keys(self.include, render)
         self.observation_space = observation_space(self._keys)
         self._render = render
-        self._grounding = Grounding()
         self._task: Task | None = task
-        self._observer = Observer(task, self.include, render)
         self._muted = True
         task.on_frame = self._on_frame
-        self._episodes = 0
         self._run: _Run | None = None
         self.scene_digest = NOT_BUILT
 
@@ -187,16 +186,18 @@ class RoboMMEEnv(gymnasium.Env):
         # Leftovers of an episode, in the solver and in what the script added, go only with the
         # scene.
         self._muted = True
-        task.reset(options={"reconfigure": self._episodes > 0})
+        task.reset(options={"reconfigure": self._run is not None})
         self._muted = False
-        self._episodes += 1
         self.scene_digest = scene_digest(task.placed_values())
         control = Control(task, self._step_control, Demonstrator(task, self._step_control))
         run = self._run = _Run(
-            control, TaskFacts(task), task.progress.displayed, task.reset_action, options=options
+            control,
+            Observer(task, self.include, self._render),
+            TaskFacts(task),
+            task.progress.displayed,
+            task.reset_action,
+            options=options,
         )
-        self._grounding.clear()
-        self._observer.start()
         # The video is the recorded one, whose texts change when its drops were noticed.
         with task.as_recorded():
             for subtask in task.progress.subtasks:
@@ -387,7 +388,7 @@ class RoboMMEEnv(gymnasium.Env):
         if self._muted:
             return
         run = self._require_run()
-        self._observer.follow()
+        run.observer.follow()
         if run.in_video and run.displayed.text == NO_RECORD:
             return  # neither rendered nor returned
         cameras: tuple[str, ...] = tuple(CAMERAS)
@@ -395,7 +396,7 @@ class RoboMMEEnv(gymnasium.Env):
             cameras = self.render_request.cameras(
                 run.returned, newest=not run.in_video and not run.control.demonstrator.left
             )
-        frame = run.newest = self._observer.frame(evaluated, cameras)
+        frame = run.newest = run.observer.frame(evaluated, cameras)
         if run.displayed.text != run.subgoal_text:
             run.began.append(run.returned)
             run.subgoal_text = run.displayed.text
@@ -461,8 +462,8 @@ class RoboMMEEnv(gymnasium.Env):
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
         }
         if self.render_request is None or self.render_request.grounded:
-            segmentation = self._observer.segmentation if self._render else None
-            info["grounded_subgoal_online"] = self._grounding.update(subtask, segmentation)
+            segmentation = run.observer.segmentation if self._render else None
+            info["grounded_subgoal_online"] = run.grounding.update(subtask, segmentation)
         if self.include.available_multi_choices or self._space.name == "multi_choice":
             info["available_multi_choices"] = self._options()
         for name in CAMERAS:
