@@ -69,10 +69,11 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
         return _counts(source, begins) if name == FACT else is_visible
     column = _read(source, name, key)
     values = column.combine_chunks()
-    nested = pa.types.is_list(values.type) or pa.types.is_large_list(values.type)
-    if pa.types.is_fixed_size_list(values.type):
-        values = values.cast(pa.list_(values.type.value_type))
-        nested = True
+    nested = (
+        pa.types.is_list(values.type)
+        or pa.types.is_large_list(values.type)
+        or pa.types.is_fixed_size_list(values.type)
+    )
     kind = values.type.value_type if nested else values.type
     require(
         pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind),
