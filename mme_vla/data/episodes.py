@@ -314,7 +314,7 @@ class EpisodeSource:
         return self._rendered[camera][start : start + length]
 
     def action_chunk(
-        self, episode: int, start: int, horizon: int, offset: int = 0
+        self, episode: int, start: int | np.ndarray, horizon: int, offset: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
         """The chunk decided at frame `start`, the last action repeated past the episode's end
         (differences are 0).
@@ -322,18 +322,21 @@ class EpisodeSource:
         Where an action takes a frame these are actions start + offset … start + offset + horizon −
         1.
 
+        Args:
+            start: a frame, or frames [n].
+
         Returns:
-            actions [horizon, w] float32, and [horizon] bool that is False on repeated ones.
+            actions [horizon, w] float32, and [horizon] bool that is False on repeated ones; of
+            frames [n, horizon, w] and [n, horizon].
         """
         if self.robot.action.frames is None:
             return self._motions_of(episode).chunk(start, horizon)
-        start += offset
+        steps = np.asarray(start)[..., None] + offset + np.arange(horizon)
         length = int(self.lengths[episode])
-        steps = np.arange(start, start + horizon)
         known = steps < length
-        first = min(start, length - 1)
-        recorded = self.actions(episode, first, min(start + horizon, length))
-        chunk = recorded[np.minimum(steps, length - 1) - first]
+        steps = np.minimum(steps, length - 1)
+        first = int(steps.min())
+        chunk = self.actions(episode, first, int(steps.max()) + 1)[steps - first]
         for place in self.robot.action.of_pose:
             chunk[~known, place] = 0
         return chunk, known

@@ -204,17 +204,7 @@ def _extremes(
                 continue
             states = source.states(episode)[steps]
             state_ends += [states.min(axis=0), states.max(axis=0)]
-            if robot.action.frames is None:
-                chunks = np.stack(
-                    [source.action_chunk(episode, int(t), horizon, action_offset)[0] for t in steps]
-                )
-            else:
-                length = int(source.lengths[episode])
-                later = steps[:, None] + action_offset + np.arange(horizon)
-                chunks = source.actions(episode)[np.minimum(later, length - 1)]
-                for place in robot.action.of_pose:
-                    # as `action_chunk` has them past the end
-                    chunks[..., place][later >= length] = 0
+            chunks, _ = source.action_chunk(episode, steps, horizon, action_offset)
             relative = robot.action.to_relative(
                 torch.from_numpy(chunks), torch.from_numpy(states)
             ).numpy()
