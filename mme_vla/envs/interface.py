@@ -34,9 +34,9 @@ from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 from mme_vla.envs.robomme.robot.control import PlanningError
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
-from mme_vla.envs.spaces import Control, UnreachableError, action_space
+from mme_vla.envs.spaces import UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
-from mme_vla.errors import UserError, check_known, require
+from mme_vla.errors import UserError, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class EpisodeState:
 class _Run:
     """One episode under way."""
 
-    control: Control
+    demonstrator: Demonstrator
     observer: Observer
     facts: TaskFacts
     displayed: "SubTask"
@@ -144,7 +144,6 @@ class RoboMMEEnv(gymnasium.Env):
     ) -> None:
         is_count = type(max_steps) is int and max_steps >= 1
         require(is_count, f"max_steps is {max_steps!r}; expected a positive integer.")
-        check_known("reward", reward, REWARDS)
         self._space = action_space(action)
         self._total_reward = REWARDS[reward]
         self.include = include or Include()
@@ -189,9 +188,8 @@ class RoboMMEEnv(gymnasium.Env):
         task.reset(options={"reconfigure": self._run is not None})
         self._muted = False
         self.scene_digest = scene_digest(task.placed_values())
-        control = Control(task, self._step_control, Demonstrator(task, self._step_control))
         run = self._run = _Run(
-            control,
+            Demonstrator(task, self._step_control),
             Observer(task, self.include, self._render),
             TaskFacts(task),
             task.progress.displayed,
@@ -226,7 +224,7 @@ class RoboMMEEnv(gymnasium.Env):
             if isinstance(action, Hold):
                 self._hold(run, action.steps)
             else:
-                self._space.act(run.control, action)
+                self._space.act(run.demonstrator, action)
             before = run.total_reward
             run.total_reward = self._total_reward(
                 self.task.progress, bool(run.info.get("success", False))
@@ -394,7 +392,7 @@ class RoboMMEEnv(gymnasium.Env):
         cameras: tuple[str, ...] = tuple(CAMERAS)
         if self.render_request is not None:
             cameras = self.render_request.cameras(
-                run.returned, newest=not run.in_video and not run.control.demonstrator.left
+                run.returned, newest=not run.in_video and not run.demonstrator.left
             )
         frame = run.newest = run.observer.frame(evaluated, cameras)
         if run.displayed.text != run.subgoal_text:
@@ -425,17 +423,17 @@ class RoboMMEEnv(gymnasium.Env):
         """Repeat the last command, while the scene continues, until the episode ends."""
         run.hold_steps += steps
         for left in reversed(range(steps)):
-            run.control.demonstrator.left = left  # the last one's frame is the newest
+            run.demonstrator.left = left  # the last one's frame is the newest
             self._step_control(run.last_action)
             if run.terminated:
                 break
-        run.control.demonstrator.left = 0
+        run.demonstrator.left = 0
 
     def _demonstrate(self, subtask: "SubTask") -> None:
         """Carry out a sub-task of the video, evaluating before and after it as at recording."""
         self.task.evaluate_planned()
         try:
-            subtask.run(self._require_run().control.demonstrator)
+            subtask.run(self._require_run().demonstrator)
         except PlanningError as error:  # the benchmark continues with the rest of the video
             log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
         self.task.evaluate_planned()

@@ -133,7 +133,7 @@ def test_a_motion_that_cannot_be_planned_is_an_error_status(
     def fail(*_: Any) -> None:
         raise PlanningError("no way")
 
-    monkeypatch.setattr(type(env._run.control.demonstrator), "move_to", fail)
+    monkeypatch.setattr(type(env._run.demonstrator), "move_to", fail)
     observation, _, terminated, _, info = env.step([0.0, 0.0, 0.3, np.pi, 0.0, 0.0, 1.0])
     assert (observation, terminated, info["exception_type"]) == (None, True, "PlanningError")
 
