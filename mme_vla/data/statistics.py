@@ -93,13 +93,18 @@ def compute_norm_stats(
             )
             actions.update(relative.numpy())
             advance(1)
-    values = actions.result(extremes).to_dict()
+    of_actions = actions.result(extremes)
     # a letter that is seldom chosen has no range
-    for name, value in (("q01", 0.0), ("q99", 1.0), ("min", 0.0), ("max", 1.0)):
-        if name in values:
-            for place in robot.action.choice:
-                values[name][place] = value
-    stats = NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
+    letters = list(robot.action.choice)
+    for bound, value in (
+        (of_actions.q01, 0),
+        (of_actions.q99, 1),
+        (of_actions.min, 0),
+        (of_actions.max, 1),
+    ):
+        if bound is not None:
+            bound[letters] = value
+    stats = NormStats(states.result(extremes), of_actions)
     return check_ranges(stats, sources, episodes, horizon, action_offset, robot, video, narrow)
 
 
