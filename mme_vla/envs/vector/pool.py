@@ -327,14 +327,9 @@ class VecEnv:
         require(not self._closed, "The environments are closed; make new ones.")
 
 
-def serve(
-    inherited: tuple[dict[str, str], Sequence[str]], connection: Any, factory: Callable[..., Any]
-) -> None:
-    """The work of a worker process: run commands until `CLOSE` or the end of the connection.
-
-    inherited: the `settings` of the process that started it.
-    """
-    begin(*inherited)
+def serve(inherited: Any, connection: Any, factory: Callable[..., Any]) -> None:
+    """The work of a worker process: run commands until `CLOSE` or the end of the connection."""
+    begin(*inherited)  # `settings` of the process that started it
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
