@@ -45,6 +45,7 @@ def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snap
     from mme_vla.envs.robomme.recording.recorder import demonstrate
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
+    task.reset()
     observer = Observer(task, Include(), render=True)
     snapshots: list[Snapshot] = []
 
@@ -55,8 +56,6 @@ def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snap
             image = observer.frame(evaluated)["front_rgb"]
             snapshots.append(Snapshot(task.steps_done, image, subtask.text, subtask.video))
 
-    task.reset()
-    observer.start()
     task.on_frame = capture
     try:
         success = demonstrate(

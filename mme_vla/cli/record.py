@@ -73,8 +73,8 @@ FAILED = "the demonstration did not end in success"
 def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
 
-    Where the rendered frames depend on the demonstration, it is made twice: first without images,
-    to choose the frames, and again with images of them.
+    Where not all frames are rendered, it is made twice: first without images, to choose the frames,
+    and again with images of them.
 
     Returns:
         Task, episode, the seed that succeeded, steps, stored steps, video steps, the failed seeds
@@ -95,8 +95,8 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
             scene |= task_options(job.row)
         blind: Recording | None = None
         try:
-            request = None if job.frames is None else job.frames.beforehand()
-            if job.frames is not None and request is None:
+            request = None
+            if job.frames is not None:
                 blind = _unseen(job.task, scene)
                 if not blind.success:
                     failures[seed] = blind.error or FAILED

@@ -36,7 +36,7 @@ from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory
-from mme_vla.utils import draft_of, remove_drafts, sum_line, write_atomically, write_json
+from mme_vla.utils import remove_drafts, sum_line, write_atomically, write_json
 
 PAGE = 4096  # bytes
 CHUNKS_AHEAD = 2
@@ -215,18 +215,30 @@ def _build_episode(
                 stored = tokens.float()
             rows.append(stored.cpu().numpy())
         advance(chunk.length)
-    drafts: dict[Path, Path] = {}
+    sums = ""
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
         path = score_file(folder, episode)
-        drafts[path] = _draft(path, np.savez, frames=np.asarray(frames, np.int64), values=stacked)
+        with write_atomically(path) as draft:
+            with draft.open("wb") as file:
+                np.savez(file, frames=np.asarray(frames, np.int64), values=stacked)
+                _flush(file)
+            sums += sum_line(draft, path.name)
     path = token_file(folder, episode)
-    drafts[path] = _draft(path, save_aligned, np.concatenate(rows))
-    sums = "".join(sum_line(draft, path.name) for path, draft in drafts.items())
-    with write_atomically(sum_file(folder, episode)) as draft:
-        draft.write_text(sums)
-    for path, draft in drafts.items():  # tokens last: where they are, all else is
-        draft.replace(path)
+    with write_atomically(path) as draft:
+        with draft.open("wb") as file:
+            save_aligned(file, np.concatenate(rows))
+            _flush(file)
+        sums += sum_line(draft, path.name)
+        # Tokens come last: where they are, all else is.
+        with write_atomically(sum_file(folder, episode)) as sum_draft:
+            sum_draft.write_text(sums)
+
+
+def _flush(file: IO[bytes]) -> None:
+    """Put what was written on the disk."""
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
@@ -240,17 +252,6 @@ def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
     described += b" " * (PAGE - 11 - len(described)) + b"\n"
     file.write(magic + len(described).to_bytes(2, "little") + described)
     file.write(np.ascontiguousarray(array).data)
-
-
-def _draft(
-    path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray
-) -> Path:
-    draft = draft_of(path)
-    with draft.open("wb") as handle:
-        writer(handle, *arrays, **named)
-        handle.flush()
-        os.fsync(handle.fileno())
-    return draft
 
 
 log = logging.getLogger(__name__)

@@ -69,10 +69,11 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
         return _counts(source, begins) if name == FACT else is_visible
     column = _read(source, name, key)
     values = column.combine_chunks()
-    nested = pa.types.is_list(values.type) or pa.types.is_large_list(values.type)
-    if pa.types.is_fixed_size_list(values.type):
-        values = values.cast(pa.list_(values.type.value_type))
-        nested = True
+    nested = (
+        pa.types.is_list(values.type)
+        or pa.types.is_large_list(values.type)
+        or pa.types.is_fixed_size_list(values.type)
+    )
     kind = values.type.value_type if nested else values.type
     require(
         pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind),
@@ -140,7 +141,7 @@ def text_column(source: EpisodeSource, name: str, key: str) -> Any:
         f"{key}: the column {name!r} of {source.name} holds {texts.type}, no texts.",
     )
     is_empty = pc.equal(pc.utf8_length(pc.utf8_trim_whitespace(texts)), 0).fill_null(True)
-    first_rows = np.cumsum(source.lengths) - source.lengths + source.exec_starts
+    first_rows = source.starts + source.exec_starts
     frames = np.arange(len(texts))
     is_executed = frames >= np.repeat(first_rows, source.lengths)
     is_empty = is_empty.to_numpy(zero_copy_only=False) & is_executed
@@ -161,7 +162,7 @@ def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
         ) from None
     codes = subgoals.fill_null("").dictionary_encode().indices.to_numpy()
     begins = np.concatenate([[True], np.diff(codes) != 0])
-    begins[np.cumsum(source.lengths) - source.lengths] = True
+    begins[source.starts] = True
     return begins.astype(np.float32)
 
 
@@ -171,8 +172,7 @@ def _counts(source: EpisodeSource, begins: np.ndarray) -> np.ndarray:
     begins: how many begin at each frame, [rows].
     """
     begun = np.cumsum(begins)
-    first = np.cumsum(source.lengths) - source.lengths
-    before = begun[first] - begins[first]
+    before = begun[source.starts] - begins[source.starts]
     return (begun - np.repeat(before, source.lengths)).astype(np.float32)
 
 
@@ -190,7 +190,6 @@ def _facts(source: EpisodeSource, key: str) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"{key}: {path} is no table of facts: {brief(error)}.") from None
     begins = np.zeros(source.lengths.sum(), np.float32)
     is_visible = np.zeros_like(begins)
-    starts = np.cumsum(source.lengths) - source.lengths
     spans: dict[tuple[int, str], list[tuple[int, int]]] = {}
     rows = table[list(kinds)].itertuples(index=False)
     for line, (episode, first, last, task, fact) in enumerate(rows, start=2):
@@ -212,8 +211,9 @@ def _facts(source: EpisodeSource, key: str) -> tuple[np.ndarray, np.ndarray]:
             f" of episode {episode}, where an earlier line has it too. Record the dataset again.",
         )
         earlier.append((first, last))
-        begins[starts[episode] + first] += 1
-        is_visible[starts[episode] + first : starts[episode] + last + 1] = 1
+        start = source.starts[episode]
+        begins[start + first] += 1
+        is_visible[start + first : start + last + 1] = 1
     return begins, is_visible
 
 
@@ -225,7 +225,7 @@ def _check(source: EpisodeSource, name: str, key: str, wrong: np.ndarray, proble
     if not len(rows):
         return
     episode, frame = source.locate(int(rows[0]))
-    episodes = np.unique(np.searchsorted(np.cumsum(source.lengths), rows, side="right")).tolist()
+    episodes = (np.unique(np.searchsorted(source.starts, rows, side="right")) - 1).tolist()
     noun = "episode" if len(episodes) == 1 else "episodes"
     raise UserError(
         f"{key}: the column {name!r} of {source.name} {problem} at frame {frame} of episode"

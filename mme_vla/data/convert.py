@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -353,33 +354,32 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    dataset = None
     goal = episode.goals[0]
     tool = {name: episode.pose_actions(name) for name in options.poses}
     if options.tool_pose:
         tool[POSE_STATE] = episode.tool_poses()
     if options.choices:
         tool[CHOICE_ACTIONS] = episode.choice_actions()
-    for step, frame in enumerate(episode):
-        if dataset is None:
-            video = options.images == "video"
-            encoder = RGBEncoderConfig(
-                vcodec=options.codec, crf=options.crf, pix_fmt=options.pix_fmt, g=options.gop
-            )
-            dataset = LeRobotDataset.create(
-                repo_id=f"local/{episode.ref.task}",
-                fps=options.fps,
-                features=features(frame.front.shape, options),
-                root=root,
-                robot_type="panda",
-                use_videos=video,
-                video_backend="pyav",
-                rgb_encoder=encoder if video else None,
-                streaming_encoding=video,
-                # LeRobot drops frames when this queue is full, as a live recorder must: never let
-                # it be.
-                encoder_queue_maxsize=episode.length + 1,
-            )
+    frames = iter(episode)
+    first = next(frames)  # an episode has at least one
+    video = options.images == "video"
+    encoder = RGBEncoderConfig(
+        vcodec=options.codec, crf=options.crf, pix_fmt=options.pix_fmt, g=options.gop
+    )
+    dataset = LeRobotDataset.create(
+        repo_id=f"local/{episode.ref.task}",
+        fps=options.fps,
+        features=features(first.front.shape, options),
+        root=root,
+        robot_type="panda",
+        use_videos=video,
+        video_backend="pyav",
+        rgb_encoder=encoder if video else None,
+        streaming_encoding=video,
+        # LeRobot drops frames when this queue is full, as a live recorder must: never let it be.
+        encoder_queue_maxsize=episode.length + 1,
+    )
+    for step, frame in enumerate(chain([first], frames)):
         row: dict[str, Any] = {
             "image": frame.front,
             "wrist_image": frame.wrist,
@@ -396,7 +396,6 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
             for camera in CAMERAS:
                 row[f"{camera}{RENDERED_SUFFIX}"] = np.array([camera in frame.rendered])
         dataset.add_frame(_spelt(row, options))
-    assert dataset is not None  # an episode has at least one frame
     dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     for path in root.glob("videos/**/*.mp4"):

@@ -59,6 +59,7 @@ class EpisodeSource:
         may be empty.
     tasks: which task each frame has.
     scales: of the state and of the action, the greatest size of each number, [w] float64.
+    starts: [e] int64, rows of the tables at which episodes begin.
     lengths: [e] int64, frames of each episode.
     exec_starts: [e] int64, its first execution frame (0 without a video).
     """
@@ -136,7 +137,7 @@ class EpisodeSource:
 
         # Episodes and rows.
         self._episodes = read_episode_table(self.root, video_columns)
-        self._starts = self._episodes.starts
+        self.starts = self._episodes.starts
         self.lengths = self._episodes.lengths
         self._video_path = info.video_path
         self._reader = VideoReader(max_open_videos)
@@ -204,14 +205,14 @@ class EpisodeSource:
         """The episode and the frame in it of a row of the tables; LeRobot calls the row `index`."""
         if not 0 <= row < int(self.lengths.sum()):
             raise IndexError(f"row {row} of {int(self.lengths.sum())}")
-        episode = int(np.searchsorted(self._starts, row, side="right")) - 1
-        return episode, row - int(self._starts[episode])
+        episode = int(np.searchsorted(self.starts, row, side="right")) - 1
+        return episode, row - int(self.starts[episode])
 
     def rows(self, episode: int, frames: np.ndarray) -> np.ndarray:
         """Rows of the tables that hold frames [n] of an episode, int64 [n]: the inverse of
         `locate`.
         """
-        return int(self._starts[episode]) + np.asarray(frames, np.int64)
+        return int(self.starts[episode]) + np.asarray(frames, np.int64)
 
     def task(self, episode: int) -> str:
         """Name of the episode's task (`VideoUnmask`), empty if the dataset does not tell."""
@@ -241,7 +242,7 @@ class EpisodeSource:
             UserError: no frame is given, and the episode has several tasks; they are named.
         """
         if frame is not None:
-            return self.tasks.at(int(self._starts[episode]) + frame)
+            return self.tasks.at(int(self.starts[episode]) + frame)
         goals = self.goals(episode)
         require(
             len(goals) == 1,
@@ -255,7 +256,7 @@ class EpisodeSource:
         """The different goals of an episode's frames, lower-case, in the order in
         which they begin.
         """
-        start = int(self._starts[episode])
+        start = int(self.starts[episode])
         return self.tasks.within(start, start + int(self.lengths[episode]))
 
     def options(self, episode: int) -> tuple[Option, ...]:
@@ -308,13 +309,13 @@ class EpisodeSource:
         placeholders.
         """
         camera = self.robot.memory_camera if camera is None else camera
-        start, length = int(self._starts[episode]), int(self.lengths[episode])
+        start, length = int(self.starts[episode]), int(self.lengths[episode])
         if camera not in self._rendered:
             return np.ones(length, bool)
         return self._rendered[camera][start : start + length]
 
     def action_chunk(
-        self, episode: int, start: int, horizon: int, offset: int = 0
+        self, episode: int, start: int | np.ndarray, horizon: int, offset: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
         """The chunk decided at frame `start`, the last action repeated past the episode's end
         (differences are 0).
@@ -322,18 +323,21 @@ class EpisodeSource:
         Where an action takes a frame these are actions start + offset … start + offset + horizon −
         1.
 
+        Args:
+            start: a frame, or frames [n].
+
         Returns:
-            actions [horizon, w] float32, and [horizon] bool that is False on repeated ones.
+            actions [horizon, w] float32, and [horizon] bool that is False on repeated ones; of
+            frames [n, horizon, w] and [n, horizon].
         """
         if self.robot.action.frames is None:
             return self._motions_of(episode).chunk(start, horizon)
-        start += offset
+        steps = np.asarray(start)[..., None] + offset + np.arange(horizon)
         length = int(self.lengths[episode])
-        steps = np.arange(start, start + horizon)
         known = steps < length
-        first = min(start, length - 1)
-        recorded = self.actions(episode, first, min(start + horizon, length))
-        chunk = recorded[np.minimum(steps, length - 1) - first]
+        steps = np.minimum(steps, length - 1)
+        first = int(steps.min())
+        chunk = self.actions(episode, first, int(steps.max()) + 1)[steps - first]
         for place in self.robot.action.of_pose:
             chunk[~known, place] = 0
         return chunk, known
@@ -437,7 +441,7 @@ class EpisodeSource:
             raise UserError(
                 f"{self.name}, episode {episode}: steps {start}…{stop - 1} asked of {length}."
             )
-        offset = int(self._starts[episode])
+        offset = int(self.starts[episode])
         return self._table[offset + start : offset + stop]
 
     def _vectors(self, kind: str, episode: int, start: int, stop: int | None) -> np.ndarray:
@@ -482,14 +486,14 @@ class EpisodeSource:
         in_tables = None
         if "is_demo" in rows:
             demo = rows["is_demo"].astype(bool)
-            in_tables = np.add.reduceat(demo, self._starts, dtype=np.int64)
-            frame = np.arange(len(demo)) - np.repeat(self._starts, self.lengths)
+            in_tables = np.add.reduceat(demo, self.starts, dtype=np.int64)
+            frame = np.arange(len(demo)) - np.repeat(self.starts, self.lengths)
             if not np.array_equal(demo, frame < np.repeat(in_tables, self.lengths)):
                 raise UserError(
                     f"{self.root}: is_demo must be true for an episode's first frames only."
                 )
         elif "exec_start_idx" in rows:
-            in_tables = rows["exec_start_idx"][self._starts]
+            in_tables = rows["exec_start_idx"][self.starts]
         if side_file is not None:
             starts = read_exec_starts(side_file, len(self))
             if in_tables is not None and not np.array_equal(starts, in_tables):

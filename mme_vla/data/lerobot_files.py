@@ -191,7 +191,8 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     if pose:
         vectors.append(("tool's pose", pose, POSE_WIDTH))
     for what, names, width in vectors:
-        if sum(features[name].width for name in names) != width:
+        widths = [features[name].width for name in names]
+        if sum(widths) != width or not all(widths):
             shapes = [f"{name} has shape {list(features[name].shape)}" for name in names]
             raise UserError(
                 f"{root}: {', '.join(shapes)}; expected [{width}], the {what} of the robot"

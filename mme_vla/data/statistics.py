@@ -13,13 +13,12 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.processing.normalise import (
+    EPSILON,
     ExactStats,
     NormStats,
     QuantileStats,
     RunningStats,
-    narrow_numbers,
     normalize,
-    widened,
 )
 
 log = logging.getLogger(__name__)
@@ -61,7 +60,6 @@ def compute_norm_stats(
         video: count the conditioning video's steps too.
         narrow: what to do about a number whose range the values leave by far (`check_ranges`).
     """
-    check_choice("narrow", narrow, NARROW)
     # All (source, episode, step) that count [n, 3].
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):
@@ -95,16 +93,23 @@ def compute_norm_stats(
             )
             actions.update(relative.numpy())
             advance(1)
-    values = actions.result(extremes).to_dict()
+    of_actions = actions.result(extremes)
     # a letter that is seldom chosen has no range
-    for name, value in (("q01", 0.0), ("q99", 1.0), ("min", 0.0), ("max", 1.0)):
-        if name in values:
-            for place in robot.action.choice:
-                values[name][place] = value
-    stats = NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
+    letters = list(robot.action.choice)
+    for bound, value in (
+        (of_actions.q01, 0),
+        (of_actions.q99, 1),
+        (of_actions.min, 0),
+        (of_actions.max, 1),
+    ):
+        if bound is not None:
+            bound[letters] = value
+    stats = NormStats(states.result(extremes), of_actions)
     return check_ranges(stats, sources, episodes, horizon, action_offset, robot, video, narrow)
 
 
+NARROW_RANGES = 100
+"""Ranges q01…q99 beyond which a value says that the range is not that of its number."""
 NARROW = ("refuse", "warn", "widen", "ignore")
 """What can be done about a range that is far too narrow; `ignore` does not look, for policies that
 do not need it.
@@ -146,9 +151,11 @@ def check_ranges(
     state, actions = _extremes(sources, episodes, horizon, action_offset, robot, video)
     names = {"state": sources[0].state_names, "actions": sources[0].robot.action.names}
     changed = {}
-    for kind, ends in (("state", state), ("actions", actions)):
+    for kind, (least, greatest) in (("state", state), ("actions", actions)):
         of = getattr(stats, kind)
-        places = narrow_numbers(of, *ends)
+        reach = np.maximum(of.q01 - least, greatest - of.q99)
+        beyond = reach > NARROW_RANGES * (of.q99 - of.q01 + EPSILON)
+        places = np.flatnonzero(beyond).tolist()
         if kind == "actions":
             places = [place for place in places if place not in robot.action.choice]
         if not places:
@@ -158,13 +165,16 @@ def check_ranges(
             name = names[kind][place] if place < len(names[kind]) else f"number {place + 1}"
             lines.append(
                 f"{name} of the {kind.removesuffix('s')} has q01 {of.q01[place]:.6g} and q99"
-                f" {of.q99[place]:.6g}, but values from {ends[0][place]:.6g} to"
-                f" {ends[1][place]:.6g}"
+                f" {of.q99[place]:.6g}, but values from {least[place]:.6g} to"
+                f" {greatest[place]:.6g}"
             )
         summary = "; ".join(lines)
         if narrow == "widen":
             log.warning("%s. Its range is widened to these values.", summary)
-            changed[kind] = widened(of, places, *ends)
+            low, high = of.q01.copy(), of.q99.copy()
+            low[places] = np.minimum(low[places], least[places])
+            high[places] = np.maximum(high[places], greatest[places])
+            changed[kind] = replace(of, q01=low, q99=high)
             continue
         message = (
             f"{summary}. Normalised by such a range they become numbers in the hundreds to"
@@ -199,17 +209,7 @@ def _extremes(
                 continue
             states = source.states(episode)[steps]
             state_ends += [states.min(axis=0), states.max(axis=0)]
-            if robot.action.frames is None:
-                chunks = np.stack(
-                    [source.action_chunk(episode, int(t), horizon, action_offset)[0] for t in steps]
-                )
-            else:
-                length = int(source.lengths[episode])
-                later = steps[:, None] + action_offset + np.arange(horizon)
-                chunks = source.actions(episode)[np.minimum(later, length - 1)]
-                for place in robot.action.of_pose:
-                    # as `action_chunk` has them past the end
-                    chunks[..., place][later >= length] = 0
+            chunks, _ = source.action_chunk(episode, steps, horizon, action_offset)
             relative = robot.action.to_relative(
                 torch.from_numpy(chunks), torch.from_numpy(states)
             ).numpy()

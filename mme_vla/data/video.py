@@ -7,7 +7,6 @@ an image.
 """
 
 import os
-import string
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,7 +20,6 @@ from mme_vla.utils import decoding, files_to_hold, inside
 
 # images: a target further ahead than this is sought, a nearer one is decoded up to
 _SEEK_BEYOND = 64
-_FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
 
 
 class VideoReader:
@@ -136,20 +134,14 @@ class VideoReader:
 
 def video_file(root: Path, template: object, view: str, chunk: int, file: int) -> Path:
     """The place of a video: `video_path` of meta/info.json, filled in."""
-    fields: list[tuple[str, str]] = []
-    try:
-        for _, name, spec, _ in string.Formatter().parse(str(template)):
-            if name is not None:
-                fields.append((name, spec or ""))
-        is_known = all(spec in _FIELDS.get(name, ()) for name, spec in fields)
-    except ValueError:
-        is_known = False
-    if not isinstance(template, str) or not is_known:
+    path = str(template)
+    for name, number in (("chunk_index", chunk), ("file_index", file)):
+        for form in ("", ":d", ":03d"):
+            path = path.replace(f"{{{name}{form}}}", format(number, form[1:]))
+    remaining = path.replace("{video_key}", "")
+    if not isinstance(template, str) or "{" in remaining or "}" in remaining:
         raise UserError(
             f"{root / 'meta' / 'info.json'}: video_path is {brief(template)}; expected a path with"
             f" the fields {{video_key}}, {{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
         )
-
-    return inside(
-        root, template.format(video_key=view, chunk_index=chunk, file_index=file), "video"
-    )
+    return inside(root, path.replace("{video_key}", view), "video")

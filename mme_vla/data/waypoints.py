@@ -22,13 +22,14 @@ class Motions:
     decisions: np.ndarray
     targets: np.ndarray
 
-    def chunk(self, frame: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        """The motions decided at `frame` and after it, the last one repeated.
+    def chunk(self, frame: int | np.ndarray, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        """The motions decided at `frame` and after it, the last one repeated; see
+        `EpisodeSource.action_chunk`.
 
         Returns:
             [horizon, w] float32, and [horizon] bool that is False on repeated ones.
         """
-        places = np.searchsorted(self.decisions, frame) + np.arange(horizon)
+        places = np.searchsorted(self.decisions, frame)[..., None] + np.arange(horizon)
         return self.targets[np.minimum(places, len(self.targets) - 1)], places < len(self.targets)
 
     def before(self, frame: int, most: int) -> np.ndarray:

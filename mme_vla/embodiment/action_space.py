@@ -122,17 +122,6 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
     return tuple(options.values())
 
 
-def in_words(options: Sequence[Option]) -> str:
-    """List the options as a prompt has them: `a pick up the cube (point), b press the button`."""
-    texts = []
-    for option in options:
-        text = f"{option.label} {option.action}"
-        if option.needs_point:
-            text += " (point)"
-        texts.append(text)
-    return ", ".join(texts)
-
-
 POSE_WIDTH = 6
 """Of a pose: position, then three angles."""
 ANGLES = (3, 4, 5)
@@ -345,11 +334,19 @@ class ActionSpace:
         return out
 
     def worded(self, goal: str, options: Sequence[Option]) -> str:
-        """The goal as the policy reads it: where it chooses among options, they stand behind it."""
+        """The goal as the policy reads it. Where it chooses among options, they stand behind it:
+        `Options: a pick up the cube (point), b press the button`.
+        """
         if not self.choice:
             return goal
         _require(options)
-        return f"{goal.rstrip(' .')}. Options: {in_words(options)}"
+        texts = []
+        for option in options:
+            text = f"{option.label} {option.action}"
+            if option.needs_point:
+                text += " (point)"
+            texts.append(text)
+        return f"{goal.rstrip(' .')}. Options: {', '.join(texts)}"
 
     def decide(self, actions: "Tensor", options: Sequence[Option]) -> "Tensor":
         """Turn the scores of letters into choices: the best of those offered is 1, all others are

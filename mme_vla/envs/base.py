@@ -88,12 +88,10 @@ class Environment(ABC):
         Raises:
             UserError: the environment has no demonstrator.
         """
-        require(
-            False,
+        raise UserError(
             f"{type(self).__name__} has no demonstrator: implement demonstrate(env), a generator of"
-            " actions.",
+            " actions."
         )
-        yield from ()
 
     def hold(self, env: Any) -> Any:
         """The action that keeps the robot where it is, for events in which it pauses, and choices
@@ -102,10 +100,9 @@ class Environment(ABC):
         Raises:
             UserError: the environment has none.
         """
-        require(
-            False,
+        raise UserError(
             f"{type(self).__name__} cannot pause, as an event or a choice without actions asks for:"
-            " implement hold(env), the action that keeps the robot where it is.",
+            " implement hold(env), the action that keeps the robot where it is."
         )
 
     def choices(self, env: Any) -> Mapping[str, Actions]:

@@ -52,9 +52,8 @@ class Fact:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Fact":
-        """What `to_dict` returned, also that of an earlier version, which wrote `shown`."""
-        key = "shown" if "shown" in values else "frames"
-        first, last = values[key]
+        """What `to_dict` returned."""
+        first, last = values["frames"]
         needed = tuple(values["needed"])
         return cls(values["name"], values["value"], (first, last), needed, values["changed"])
 

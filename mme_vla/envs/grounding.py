@@ -67,10 +67,6 @@ class Grounding:
 
     def __init__(self, retry: bool = True) -> None:
         self.retry = retry
-        self.clear()
-
-    def clear(self) -> None:
-        """Begin an episode."""
         self._subtask: SubTask | None = None
         self._text: str | None = None
         self._settled = False

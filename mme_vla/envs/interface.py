@@ -9,7 +9,7 @@ only when the environment renders.
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -30,12 +30,13 @@ from mme_vla.envs.observations import (
     frame_keys,
     observation_space,
 )
+from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 from mme_vla.envs.robomme.robot.control import PlanningError
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
-from mme_vla.envs.spaces import Control, UnreachableError, action_space
+from mme_vla.envs.spaces import UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
-from mme_vla.errors import UserError, check_known, require
+from mme_vla.errors import UserError, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
@@ -60,49 +61,28 @@ class EpisodeState:
     variables belong to the state as well. A replay without images takes about two milliseconds a
     control step. Can be pickled.
 
-    task, seed, difficulty, recovery, in_view, stress, row: the scene.
-    action_space, max_steps: of the environment.
+    environment: what makes the scene, the action space and the limit, by name.
     options: of the reset.
     actions: all that were given to `step` since.
     """
 
-    task: str
-    seed: int
-    difficulty: str
-    recovery: str | None
-    in_view: bool
-    stress: dict[str, int]
-    row: Mapping[str, Any] | None
-    action_space: str
-    max_steps: int
+    environment: Mapping[str, Any]
     options: dict[str, Any]
-    actions: tuple[Any, ...]
-
-    def check(self, other: "EpisodeState") -> None:
-        """Make sure that an environment whose own state is `other` can continue from here."""
-        differences = []
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            present = getattr(other, entry.name)
-            if entry.name not in ("options", "actions") and value != present:
-                differences.append(f"{entry.name} {value!r} (here {present!r})")
-        require(
-            not differences,
-            f"This state is of another environment: {', '.join(differences)}. Make one of the same"
-            " episode.",
-        )
+    actions: Sequence[Any]
 
 
 @dataclass
 class _Run:
     """One episode under way."""
 
-    control: Control
+    demonstrator: Demonstrator
+    observer: Observer
     facts: TaskFacts
     displayed: "SubTask"
     """Whose text describes the present frame."""
     last_action: np.ndarray
     in_video: bool = True
+    grounding: Grounding = field(default_factory=Grounding)
     frames: list[dict[str, Any]] = field(default_factory=list)
     """Those that the present call returns."""
     newest: dict[str, Any] = field(default_factory=dict)
@@ -164,7 +144,6 @@ class RoboMMEEnv(gymnasium.Env):
     ) -> None:
         is_count = type(max_steps) is int and max_steps >= 1
         require(is_count, f"max_steps is {max_steps!r}; expected a positive integer.")
-        check_known("reward", reward, REWARDS)
         self._space = action_space(action)
         self._total_reward = REWARDS[reward]
         self.include = include or Include()
@@ -176,12 +155,9 @@ class RoboMMEEnv(gymnasium.Env):
         self._keys = frame_keys(self.include, render)
         self.observation_space = observation_space(self._keys)
         self._render = render
-        self._grounding = Grounding()
         self._task: Task | None = task
-        self._observer = Observer(task, self.include, render)
         self._muted = True
         task.on_frame = self._on_frame
-        self._episodes = 0
         self._run: _Run | None = None
         self.scene_digest = NOT_BUILT
 
@@ -209,16 +185,17 @@ class RoboMMEEnv(gymnasium.Env):
         # Leftovers of an episode, in the solver and in what the script added, go only with the
         # scene.
         self._muted = True
-        task.reset(options={"reconfigure": self._episodes > 0})
+        task.reset(options={"reconfigure": self._run is not None})
         self._muted = False
-        self._episodes += 1
         self.scene_digest = scene_digest(task.placed_values())
-        control = Control(task, self._step_control, Demonstrator(task, self._step_control))
         run = self._run = _Run(
-            control, TaskFacts(task), task.progress.displayed, task.reset_action, options=options
+            Demonstrator(task, self._step_control),
+            Observer(task, self.include, self._render),
+            TaskFacts(task),
+            task.progress.displayed,
+            task.reset_action,
+            options=options,
         )
-        self._grounding.clear()
-        self._observer.start()
         # The video is the recorded one, whose texts change when its drops were noticed.
         with task.as_recorded():
             for subtask in task.progress.subtasks:
@@ -247,7 +224,7 @@ class RoboMMEEnv(gymnasium.Env):
             if isinstance(action, Hold):
                 self._hold(run, action.steps)
             else:
-                self._space.act(run.control, action)
+                self._space.act(run.demonstrator, action)
             before = run.total_reward
             run.total_reward = self._total_reward(
                 self.task.progress, bool(run.info.get("success", False))
@@ -277,23 +254,22 @@ class RoboMMEEnv(gymnasium.Env):
     def save_state(self) -> EpisodeState:
         """The state of the running episode, for `restore_state`; costs next to nothing."""
         run = self._require_run()
-        return self._state(run.options, run.actions)
+        return EpisodeState(self._described(), run.options, tuple(run.actions))
 
-    def _state(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
+    def _described(self) -> dict[str, Any]:
+        """What an environment must have in common with another one to continue its episodes."""
         task = self.task
-        return EpisodeState(
-            task=type(task).__name__,
-            seed=task.seed,
-            difficulty=task.difficulty,
-            recovery=task.recovery,
-            in_view=task.in_view,
-            stress=task.stress,
-            row=task.row,
-            action_space=self._space.name,
-            max_steps=self.max_steps,
-            options=options,
-            actions=tuple(actions),
-        )
+        return {
+            "task": type(task).__name__,
+            "seed": task.seed,
+            "difficulty": task.difficulty,
+            "recovery": task.recovery,
+            "in_view": task.in_view,
+            "stress": task.stress,
+            "row": task.row,
+            "action_space": self._space.name,
+            "max_steps": self.max_steps,
+        }
 
     def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Continue from a saved state of the same episode, which may come from another environment
@@ -306,7 +282,16 @@ class RoboMMEEnv(gymnasium.Env):
             Observation lists and info, as the last `reset` or `step` before `save_state` returned
             them, images of the newest frame alone.
         """
-        state.check(self._state({}, ()))
+        differences = []
+        for name, present in self._described().items():
+            value = state.environment[name]
+            if value != present:
+                differences.append(f"{name} {value!r} (here {present!r})")
+        require(
+            not differences,
+            f"This state is of another environment: {', '.join(differences)}. Make one of the same"
+            " episode.",
+        )
         hook = self.on_frame
         request = self.render_request
         grounded = request is None or request.grounded
@@ -383,6 +368,13 @@ class RoboMMEEnv(gymnasium.Env):
         x, y, _ = self.task.tcp_pose.p.tolist()
         return [x, y]
 
+    def oracle(self) -> Mapping[str, Any] | None:
+        """The choice that the task's script takes next; None where it has none."""
+        try:
+            return oracle_choice(self.task)[0]
+        except OracleStuckError:
+            return None
+
     @property
     def steps_counted(self) -> int:
         """Control steps that count towards the limit."""
@@ -394,15 +386,15 @@ class RoboMMEEnv(gymnasium.Env):
         if self._muted:
             return
         run = self._require_run()
-        self._observer.follow()
+        run.observer.follow()
         if run.in_video and run.displayed.text == NO_RECORD:
             return  # neither rendered nor returned
         cameras: tuple[str, ...] = tuple(CAMERAS)
         if self.render_request is not None:
             cameras = self.render_request.cameras(
-                run.returned, newest=not run.in_video and not run.control.demonstrator.left
+                run.returned, newest=not run.in_video and not run.demonstrator.left
             )
-        frame = run.newest = self._observer.frame(evaluated, cameras)
+        frame = run.newest = run.observer.frame(evaluated, cameras)
         if run.displayed.text != run.subgoal_text:
             run.began.append(run.returned)
             run.subgoal_text = run.displayed.text
@@ -431,17 +423,17 @@ class RoboMMEEnv(gymnasium.Env):
         """Repeat the last command, while the scene continues, until the episode ends."""
         run.hold_steps += steps
         for left in reversed(range(steps)):
-            run.control.demonstrator.left = left  # the last one's frame is the newest
+            run.demonstrator.left = left  # the last one's frame is the newest
             self._step_control(run.last_action)
             if run.terminated:
                 break
-        run.control.demonstrator.left = 0
+        run.demonstrator.left = 0
 
     def _demonstrate(self, subtask: "SubTask") -> None:
         """Carry out a sub-task of the video, evaluating before and after it as at recording."""
         self.task.evaluate_planned()
         try:
-            subtask.run(self._require_run().control.demonstrator)
+            subtask.run(self._require_run().demonstrator)
         except PlanningError as error:  # the benchmark continues with the rest of the video
             log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
         self.task.evaluate_planned()
@@ -468,8 +460,8 @@ class RoboMMEEnv(gymnasium.Env):
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
         }
         if self.render_request is None or self.render_request.grounded:
-            segmentation = self._observer.segmentation if self._render else None
-            info["grounded_subgoal_online"] = self._grounding.update(subtask, segmentation)
+            segmentation = run.observer.segmentation if self._render else None
+            info["grounded_subgoal_online"] = run.grounding.update(subtask, segmentation)
         if self.include.available_multi_choices or self._space.name == "multi_choice":
             info["available_multi_choices"] = self._options()
         for name in CAMERAS:

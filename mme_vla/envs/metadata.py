@@ -15,7 +15,9 @@ from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
 
 from mme_vla.envs.rows import (
     DIFFICULTIES,
@@ -26,9 +28,10 @@ from mme_vla.envs.rows import (
     rows_of,
     task_options,
 )
-from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
+from mme_vla.errors import UserError, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
 from mme_vla.utils import read_json
+from mme_vla.utils.validation import validated
 
 TASK_NAMES = (
     "PickXtimes", "StopCube", "SwingXtimes", "BinFill",
@@ -64,8 +67,6 @@ count: repetitions or visits more. containers: more, over nothing. swaps: more o
 more between what is shown and the execution. path: discs more on the way. distractors: more objects
 that are not targets.
 """
-SESSIONS = "sessions"
-"""A dial of records of an earlier version: unrelated episodes before each."""
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 HARD, CHALLENGE = "hard", "challenge"
 """The test split's hard episodes (its numbers 3, 7, …, 47), and the held-out scenes of the 2026
@@ -115,12 +116,6 @@ class Variant:
             f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is"
             " none.",
         )
-        require(
-            self.dial != SESSIONS,
-            f"split={STRESS}:{SESSIONS}: episodes before each change no scene, so no split has"
-            " them: `mme-vla probe online=true recordings=<dataset>"
-            f" with=distract:{self.turned}` shows them.",
-        )
         if self.dial:
             dials = [dial for dial, tasks in DIALS.items() if task in tasks]
             require(
@@ -147,7 +142,7 @@ def read_variant(split: str) -> Variant | None:
             f" {', '.join(DIALS)}."
         )
     require(
-        match[1] in DIALS or match[1] == SESSIONS,
+        match[1] in DIALS,
         f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], DIALS)}",
     )
     return Variant(dial=match[1], turned=int(match[2]))
@@ -184,6 +179,7 @@ _FIRST_SEED = {
     "train": (0, 1000), "val": (1_000_000, 10_000), "test": _TEST_SEED, MORE: (2_000_000, 100_000),
     RESERVED: (5_000_000, 10_000), **dict.fromkeys(FURTHER_SPLITS, _TEST_SEED),
 }  # fmt: skip
+_WholeNumber = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 
 
@@ -365,27 +361,30 @@ def file_name(task: str) -> str:
     return f"record_dataset_{task}_metadata.json"
 
 
+class _OfficialEpisode(BaseModel):
+    """What is read of an episode in an official metadata file."""
+
+    episode: _WholeNumber
+    seed: _WholeNumber
+    difficulty: Literal["easy", "medium", "hard"]
+
+
+class _OfficialFile(BaseModel):
+    """What is read of an official metadata file."""
+
+    records: Annotated[list[_OfficialEpisode], Field(min_length=1)]
+
+
 def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
     """The episodes that an official metadata file describes, in order."""
-    records = read_json(path, f"official metadata of {task}, split {split!r}").get("records")
-    require(
-        isinstance(records, list) and records,
-        f"{path} is not official metadata: it has no list of records. Get the file again.",
-    )
+    content = read_json(path, f"official metadata of {task}, split {split!r}")
+    try:
+        records = validated(_OfficialFile, content, "The file").records
+    except UserError as error:
+        raise UserError(f"{path} is not official metadata: {error} Get the file again.") from None
     specs = []
     for record in records:
-        fields: dict[str, Any] = record if isinstance(record, dict) else {}
-        number: Any = fields.get("episode")
-        seed: Any = fields.get("seed")
-        difficulty: Any = fields.get("difficulty")
-        are_numbers = all(type(value) is int and 0 <= value < 2**31 for value in (number, seed))
-        if not are_numbers or difficulty not in DIFFICULTIES:
-            raise UserError(
-                f"{path} is not official metadata: a record has episode {brief(number)}, seed"
-                f" {brief(seed)} and difficulty {brief(difficulty)}; expected two whole numbers"
-                f" and one of {', '.join(DIFFICULTIES)}. Get the file again."
-            )
-        specs.append(EpisodeSpec(task, split, number, seed, difficulty))
+        specs.append(EpisodeSpec(task, split, record.episode, record.seed, record.difficulty))
     specs.sort(key=lambda spec: spec.episode)
     is_complete = [spec.episode for spec in specs] == list(range(len(specs)))
     require(is_complete, f"{path} does not number its episodes 0, 1, 2, …; get the file again.")

@@ -92,10 +92,6 @@ class AngleTrack:
     """
 
     def __init__(self) -> None:
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget the previous frame."""
         self._quaternion: np.ndarray | None = None
         self._angles: np.ndarray | None = None
 
@@ -116,10 +112,10 @@ class AngleTrack:
 
 
 class Observer:
-    """Makes frames of a task.
+    """Makes frames of an episode.
 
     Args:
-        task: the simulated task.
+        task: the simulated task, after its reset.
         include: what the frames hold beyond the standard keys.
         render: take images; without it frames hold the robot's state only.
     """
@@ -129,12 +125,7 @@ class Observer:
         self.include = include
         self.render = render
         self._angles = AngleTrack()
-        self._eef = np.zeros(6)
         self._taken: set[str] = set()
-
-    def start(self) -> None:
-        """Begin an episode."""
-        self._angles.clear()
         self.follow()
 
     def follow(self) -> None:

@@ -2,7 +2,6 @@
 taught by.
 """
 
-from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -49,22 +48,6 @@ def oracle_choice(task: Any) -> tuple[dict[str, Any], str]:
         _stuck(f"the sub-task {subtask.text!r} is about nothing that its option can choose")
     pixel = np.clip(np.rint(project(targets[0].position)), 0, SIDE - 1)
     return {"choice": choice.label, "point": pixel.tolist()}, subtask.text
-
-
-def oracle_of(env: Any) -> Mapping[str, Any] | None:
-    """The oracle's action in an environment by choices; None where its script has none.
-
-    A task of this library has its script. Any other environment has an oracle if it has a method
-    `oracle()`, which returns such a choice or None.
-    """
-    task = getattr(env, "task", None)
-    if task is None:
-        oracle: Mapping[str, Any] | None = env.oracle()
-        return oracle
-    try:
-        return oracle_choice(task)[0]
-    except OracleStuckError:
-        return None
 
 
 def _stuck(reason: str) -> NoReturn:

@@ -13,8 +13,6 @@ hold a stick need no gripper number.
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
@@ -29,21 +27,10 @@ from mme_vla.errors import UserError, check_known, did_you_mean, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-    from mme_vla.envs.task import Task
 
 
 class UnreachableError(RuntimeError):
     """A pose that no joint angles reach from where the arm stands."""
-
-
-@dataclass
-class Control:
-    """What an action space acts with during one episode."""
-
-    task: "Task"
-    step: Callable[[np.ndarray], Any]
-    """Does one control step with an action [8], or [7] for the stick."""
-    demonstrator: "Demonstrator"
 
 
 class ActionSpace(ABC):
@@ -59,7 +46,7 @@ class ActionSpace(ABC):
         return gymnasium.spaces.Box(-np.inf, np.inf, (self.width + (not stick),), np.float32)
 
     @abstractmethod
-    def act(self, control: Control, action: Any) -> None:
+    def act(self, robot: "Demonstrator", action: Any) -> None:
         """Do the control steps of one action.
 
         Raises:
@@ -75,11 +62,11 @@ class JointAngle(ActionSpace):
     name = "joint_angle"
     width = ARM_JOINTS
 
-    def act(self, control: Control, action: Any) -> None:
-        stick = control.task.stick
+    def act(self, robot: "Demonstrator", action: Any) -> None:
+        stick = robot.env.stick
         width = self.width + (not stick)
         numbers = _numbers(action, width, "seven joint angles and the gripper", longer=stick)
-        control.step(numbers[:width])
+        robot.step(numbers[:width])
 
 
 class EndEffectorPose(ActionSpace):
@@ -89,15 +76,15 @@ class EndEffectorPose(ActionSpace):
 
     name = "ee_pose"
 
-    def act(self, control: Control, action: Any) -> None:
-        stick = control.task.stick
+    def act(self, robot: "Demonstrator", action: Any) -> None:
+        stick = robot.env.stick
         numbers = _pose_numbers(action, stick)
-        joints = control.demonstrator.arm.ik(_pose(numbers), control.task.qpos)
+        joints = robot.arm.ik(_pose(numbers), robot.env.qpos)
         if joints is None:
             raise UnreachableError(
                 f"IK failed: no joint angles reach the pose {np.round(numbers[:6], 4).tolist()}."
             )
-        control.step(joints if stick else np.append(joints, numbers[6]))
+        robot.step(joints if stick else np.append(joints, numbers[6]))
 
 
 class Waypoint(ActionSpace):
@@ -107,10 +94,9 @@ class Waypoint(ActionSpace):
 
     name = "waypoint"
 
-    def act(self, control: Control, action: Any) -> None:
-        stick = control.task.stick
+    def act(self, robot: "Demonstrator", action: Any) -> None:
+        stick = robot.env.stick
         numbers = _pose_numbers(action, stick)
-        robot = control.demonstrator
         grip = None
         if not stick:  # any other number leaves the gripper as it is
             grip = {-1.0: robot.close, 1.0: robot.open}.get(numbers[6])
@@ -135,14 +121,14 @@ class MultiChoice(ActionSpace):
         point = gymnasium.spaces.Box(0, SIDE, (2,), np.float64)
         return gymnasium.spaces.Dict({"choice": gymnasium.spaces.Text(1), "point": point})
 
-    def act(self, control: Control, action: Any) -> None:
+    def act(self, robot: "Demonstrator", action: Any) -> None:
         is_choice = isinstance(action, dict) and isinstance(action.get("choice"), str)
         require(
             is_choice,
             f'Action {action!r} is no choice; expected {{"choice": "A", "point": [y, x]}}.',
         )
         label = action["choice"].strip().lower()
-        choices = {choice.label: choice for choice in control.task.choices()}
+        choices = {choice.label: choice for choice in robot.env.choices()}
         if label not in choices:
             # As in the benchmark, an unknown letter makes no step.
             warnings.warn(
@@ -152,7 +138,7 @@ class MultiChoice(ActionSpace):
             return
         choice = choices[label]
         if choice.candidates is None:
-            choice.run(control.demonstrator, None)
+            choice.run(robot, None)
             return
         point = action.get("point")
         require(
@@ -166,7 +152,7 @@ class MultiChoice(ActionSpace):
             choice.candidates,
             key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)),
         )
-        choice.run(control.demonstrator, nearest)
+        choice.run(robot, nearest)
 
 
 SPACES: dict[str, ActionSpace] = {

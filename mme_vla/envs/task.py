@@ -25,12 +25,6 @@ from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import check_known, require
 
 RECOVERY_MODES = ("z", "xy")
-_FORMER_NAMES = {
-    "evidence": "visible_facts",
-    "shown_facts": "visible_facts",
-    "evidence_choices": "fact_choices",
-}
-"""What tasks of earlier versions define → what replaced it."""
 
 
 def candidates_among(things: Sequence[Thing], correct: Sequence[Thing]) -> Candidates:
@@ -76,14 +70,6 @@ class Task(Stage):
     """Dials of `metadata.DIALS` that the task has."""
     fact_choices: ClassVar[str | None] = None
     """Letters of the options whose ends show what is to be remembered; None: all of them."""
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        for former, name in _FORMER_NAMES.items():
-            require(
-                former not in vars(cls),
-                f"{cls.__name__}.{former} is not read any more: define {name} instead.",
-            )
 
     def __init__(
         self,

@@ -289,12 +289,11 @@ class RunningStats:
     whose bins nothing widens.
     """
 
-    def __init__(self, bins: int = BINS) -> None:
-        self._bins = bins
+    def __init__(self) -> None:
         self._count = 0
         empty: np.ndarray = np.zeros(0)
         self._mean = self._square = self._low = self._high = empty  # [d]
-        self._edges = self._counts = empty  # [d, bins + 1] and [d, bins]
+        self._edges = self._counts = empty  # [d, BINS + 1] and [d, BINS]
         self._magnitudes: list[_Magnitudes] = []  # [d]
 
     @property
@@ -317,8 +316,8 @@ class RunningStats:
             self._mean, self._square = np.zeros((2, rows.shape[1]))
             self._low, self._high = low, high
             # A hair of room, so that a dimension that never moves still has bins.
-            self._edges = np.linspace(low - 1e-10, high + 1e-10, self._bins + 1, axis=1)
-            self._counts = np.zeros((rows.shape[1], self._bins))
+            self._edges = np.linspace(low - 1e-10, high + 1e-10, BINS + 1, axis=1)
+            self._counts = np.zeros((rows.shape[1], BINS))
             self._magnitudes = [_Magnitudes(centre) for centre in np.median(rows, axis=0)]
         elif rows.shape[1] != len(self._mean):
             raise UserError(
@@ -327,7 +326,7 @@ class RunningStats:
         elif (low < self._low).any() or (high > self._high).any():
             self._low = np.minimum(low, self._low)
             self._high = np.maximum(high, self._high)
-            edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)
+            edges = np.linspace(self._low, self._high, BINS + 1, axis=1)
             for i, (old, new) in enumerate(zip(self._edges, edges, strict=True)):
                 self._counts[i] = np.histogram(old[:-1], new, weights=self._counts[i])[0]
             self._edges = edges
@@ -347,7 +346,7 @@ class RunningStats:
         require(self._count >= 2, f"Statistics need at least two rows, got {self._count}.")
         std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
         low, high = self._quantile(0.01), self._quantile(0.99)
-        widths = (self._high - self._low) / self._bins
+        widths = (self._high - self._low) / BINS
         for d, magnitudes in enumerate(self._magnitudes):
             fine_low, fine_high = magnitudes.quantile(0.01), magnitudes.quantile(0.99)
             if 0 < fine_high - fine_low < FEWEST_BINS * widths[d]:
@@ -360,32 +359,6 @@ class RunningStats:
     def _quantile(self, q: float) -> np.ndarray:
         below = self._counts.cumsum(1) < q * self._count
         return self._edges[np.arange(len(below)), below.sum(1)]
-
-
-NARROW_RANGES = 100
-"""Ranges q01…q99 beyond which a value says that the range is not that of its number."""
-
-
-def narrow_numbers(stats: QuantileStats, least: np.ndarray, greatest: np.ndarray) -> list[int]:
-    """The numbers whose values lie more than `NARROW_RANGES` ranges q01…q99 below or above it.
-
-    Args:
-        least, greatest: the extremes of the values, [d].
-    """
-    reach = np.maximum(stats.q01 - least, greatest - stats.q99)
-    return np.flatnonzero(reach > NARROW_RANGES * (stats.q99 - stats.q01 + EPSILON)).tolist()
-
-
-def widened(
-    stats: QuantileStats, places: list[int], least: np.ndarray, greatest: np.ndarray
-) -> QuantileStats:
-    """The same statistics, q01 and q99 of these numbers moved out to the extremes [d] of their
-    values.
-    """
-    low, high = stats.q01.copy(), stats.q99.copy()
-    low[places] = np.minimum(low[places], least[places])
-    high[places] = np.maximum(high[places], greatest[places])
-    return replace(stats, q01=low, q99=high)
 
 
 # multiples of the widest range; a broken driver says 1e30, a robot never leaves its joints' limits

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.building import shape_of
-from mme_vla.config.sections import without
+from mme_vla.config.sections import section_keys, without
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import (
@@ -18,7 +18,6 @@ from mme_vla.errors import (
     brief,
     check_choice,
     check_integer,
-    did_you_mean,
     listed,
     require,
 )
@@ -302,13 +301,8 @@ class Processor(PolicyProcessor):
                 `embodiment` as `Embodiment.to_dict` writes it. `tokenizer_fingerprint`, if given,
                 is checked.
         """
-        settings = dict(config)
         known = {*inspect.signature(cls).parameters, "tokenizer_fingerprint"}
-        for key in settings:
-            if key not in known:
-                raise UserError(
-                    f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}"
-                )
+        settings = section_keys(config, "processor", known)
         for key in ("image_size", "tokenizer", "embodiment"):
             require(
                 key in settings,

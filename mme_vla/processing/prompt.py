@@ -4,15 +4,15 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import NonNegativeInt, Range, read_section
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, brief, check_choice, require
+from mme_vla.errors import UserError, brief
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.registry import PROMPTS
 from mme_vla.utils import is_text
@@ -245,7 +245,6 @@ def warn_once(message: str, key: object = None) -> None:
         warnings.warn(message, stacklevel=3)
 
 
-KINDS = ("simple_subgoal", "grounded_subgoal")
 POINT = re.compile(r"at <(-?\d+), (-?\d+)>")
 STD_PER_LIMIT = 1 / 2.5  # the noise's standard deviation, as a share of where it is cut off
 
@@ -261,21 +260,9 @@ class SubgoalText:
         numbers, cut off here and rounded. 0 adds none. The result may leave the image, as released.
     """
 
-    kind: str
-    online_probability: float = 0.5
-    point_noise: int = 8
-
-    def __post_init__(self) -> None:
-        check_choice("subgoal_text.kind", self.kind, KINDS)
-        probability = self.online_probability
-        require(
-            0 <= probability <= 1,
-            f"subgoal_text.online_probability={probability} must lie between 0 and 1.",
-        )
-        require(
-            self.point_noise >= 0,
-            f"subgoal_text.point_noise={self.point_noise} must be 0 or more pixels.",
-        )
+    kind: Literal["simple_subgoal", "grounded_subgoal"]
+    online_probability: Annotated[float, Range(0, 1)] = 0.5
+    point_noise: NonNegativeInt = 8
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:

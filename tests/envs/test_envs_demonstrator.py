@@ -149,7 +149,7 @@ def test_a_button_is_pressed_and_released() -> None:
         log._step(action)
         deepest = max(deepest, button.depth)
 
-    demonstrator._step = step
+    demonstrator.step = step
     demonstrator.press(button, hold=False)
     assert deepest > 0.005 > button.depth
     assert log.grips == [-1, -1, -1, -1]
@@ -184,7 +184,7 @@ def test_a_hard_reset_returns_the_arm() -> None:
     demonstrator.move_to(demonstrator.at([-0.2, 0.2, 0.2]))
     before = len(log.actions)
     flags = []
-    demonstrator._step = lambda action: (
+    demonstrator.step = lambda action: (
         log._step(action),
         flags.append((env.reset_in_progress, env.after_video)),
     )
@@ -303,7 +303,7 @@ def test_the_stick_goes_around() -> None:
     demonstrator.stick_to(things(env)["from"])
     before = len(log.actions)
     xs = []
-    demonstrator._step = lambda action: (log._step(action), xs.append(env.tcp_pose.p[0]))
+    demonstrator.step = lambda action: (log._step(action), xs.append(env.tcp_pose.p[0]))
     demonstrator.stick_arc(things(env)["to"], "clockwise")
     assert len(log.actions) - before == 50
     assert distance_xy(env.tcp_pose.p, np.array([-0.1, 0.07])) < 0.03

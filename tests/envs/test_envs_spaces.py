@@ -1,5 +1,6 @@
 """Action spaces: what they make of an action, and what they refuse."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ sapien = pytest.importorskip(
 )
 
 from mme_vla.envs.grounding import project  # noqa: E402
-from mme_vla.envs.spaces import Control, UnreachableError, action_space  # noqa: E402
+from mme_vla.envs.spaces import UnreachableError, action_space  # noqa: E402
 from mme_vla.envs.subtasks import Choice  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 
@@ -22,7 +23,9 @@ POSE = [0.1, 0.0, 0.2, np.pi, 0.0, 0.0]
 class Hand:
     """A fake demonstrator, which keeps the calls."""
 
-    def __init__(self, reachable: bool = True) -> None:
+    def __init__(self, env: Any, step: Callable[[np.ndarray], None], reachable: bool) -> None:
+        self.env = env
+        self.step = step
         self.done: list[Any] = []
         self.arm = SimpleNamespace(ik=lambda pose, qpos: np.arange(7.0) if reachable else None)
 
@@ -41,9 +44,8 @@ class Cube:
         self.position = np.array(position)
 
 
-def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list, Hand]:
+def control(stick: bool = False, reachable: bool = True) -> tuple[Any, list]:
     steps: list[np.ndarray] = []
-    hand = Hand(reachable)
     cubes = [Cube(0.0, -0.1, 0.02), Cube(0.0, 0.1, 0.02)]
     choices = [
         Choice("a", "pick up the cube", lambda demo, thing: demo.done.append(thing), cubes),
@@ -52,7 +54,7 @@ def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list,
     task = SimpleNamespace(
         stick=stick, qpos=np.zeros(7 if stick else 9), choices=lambda: choices, cubes=cubes
     )
-    return Control(task, steps.append, hand), steps, hand  # type: ignore[arg-type]
+    return Hand(task, steps.append, reachable), steps
 
 
 @pytest.mark.parametrize(
@@ -69,8 +71,8 @@ def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list,
 def test_joints_and_poses_are_one_step(
     name: str, stick: bool, action: list[float], step: list[float]
 ) -> None:
-    targets, steps, _ = control(stick)
-    action_space(name).act(targets, action)
+    hand, steps = control(stick)
+    action_space(name).act(hand, action)
     np.testing.assert_array_equal(steps, [step])
 
 
@@ -87,8 +89,8 @@ def test_joints_and_poses_are_one_step(
 def test_a_waypoint_moves_a_gripper_only_at_exactly_one(
     stick: bool, gripper: float, expected: list[str]
 ) -> None:
-    targets, _, hand = control(stick)
-    action_space("waypoint").act(targets, [*POSE, gripper])
+    hand, _ = control(stick)
+    action_space("waypoint").act(hand, [*POSE, gripper])
     assert hand.done == [[0.1, 0.0, 0.2], *expected]
 
 
@@ -117,41 +119,41 @@ def test_a_waypoint_moves_a_gripper_only_at_exactly_one(
 def test_malformed_actions_are_refused_without_a_step(
     name: str, stick: bool, action: Any, words: str
 ) -> None:
-    targets, steps, hand = control(stick)
+    hand, steps = control(stick)
     with pytest.raises(UserError, match=words):
-        action_space(name).act(targets, action)
+        action_space(name).act(hand, action)
     assert not steps
     assert not hand.done
 
 
 def test_an_unreachable_pose_says_so() -> None:
-    targets, steps, _ = control(reachable=False)
+    hand, steps = control(reachable=False)
     with pytest.raises(UnreachableError, match="IK failed"):
-        action_space("ee_pose").act(targets, [*POSE, 1.0])
+        action_space("ee_pose").act(hand, [*POSE, 1.0])
     assert not steps
 
 
 @pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize("label", ["A", "a"])
 def test_a_choice_takes_the_object_nearest_to_the_point(index: int, label: str) -> None:
-    targets, _, hand = control()
-    expected = targets.task.cubes[index]  # type: ignore[attr-defined]
+    hand, _ = control()
+    expected = hand.env.cubes[index]
     action_space("multi_choice").act(
-        targets, {"choice": label, "point": project(expected.position) + 3}
+        hand, {"choice": label, "point": project(expected.position) + 3}
     )
     assert hand.done == [expected]
 
 
 def test_a_choice_without_an_object_needs_no_point() -> None:
-    targets, _, hand = control()
-    action_space("multi_choice").act(targets, {"choice": "B", "point": []})
+    hand, _ = control()
+    action_space("multi_choice").act(hand, {"choice": "B", "point": []})
     assert hand.done == ["pressed"]
 
 
 def test_an_unknown_choice_takes_no_step_and_warns() -> None:
-    targets, steps, hand = control()
+    hand, steps = control()
     with pytest.warns(UserWarning, match="Unknown choice 'Z'.*Known: a, b"):
-        action_space("multi_choice").act(targets, {"choice": "Z"})
+        action_space("multi_choice").act(hand, {"choice": "Z"})
     assert not steps
     assert not hand.done
 
@@ -159,6 +161,6 @@ def test_an_unknown_choice_takes_no_step_and_warns() -> None:
 @pytest.mark.parametrize("stick", [False, True])
 @pytest.mark.parametrize("name", ["joint_angle", "ee_pose", "waypoint"])
 def test_sampled_actions_have_the_size_of_the_space(name: str, stick: bool) -> None:
-    targets, steps, hand = control(stick)
-    action_space(name).act(targets, action_space(name).space(stick).sample())
+    hand, steps = control(stick)
+    action_space(name).act(hand, action_space(name).space(stick).sample())
     assert len(steps) + len(hand.done) >= 1

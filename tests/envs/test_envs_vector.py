@@ -233,8 +233,9 @@ def test_closing_ends_a_worker_whose_reply_nobody_took() -> None:
     assert time.monotonic() - start < pool._CLOSING_SECONDS, "it had to be terminated"
 
 
-def tell(file: Path) -> None:
+def tell(inherited: tuple[Any, Any], file: Path) -> None:
     """What a process finds when it begins."""
+    begin(*inherited)
     file.write_text(
         f"{os.environ.get('SETTING')} {gc.get_freeze_count()} {'sapien' in sys.modules}"
     )
@@ -246,9 +247,7 @@ def test_processes_begin_with_the_settings_of_their_time_and_all_imports_left_ou
     pytest.importorskip("sapien", reason="needs the simulator: uv sync --inexact --extra sim")
     for value in ("first", "second"):
         monkeypatch.setenv("SETTING", value)
-        process = simulating_processes().Process(
-            target=begin, args=(settings(), tell, tmp_path / value)
-        )
+        process = simulating_processes().Process(target=tell, args=(settings(), tmp_path / value))
         process.start()
         process.join(60)
         setting, frozen, imported = (tmp_path / value).read_text().split()

@@ -12,7 +12,7 @@ import pytest
 
 from helpers import REPOSITORY
 from helpers.tiers import slow_or_nightly
-from mme_vla import Fact, UserError
+from mme_vla import Fact
 from mme_vla.config.plugins import import_plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes
@@ -227,27 +227,6 @@ def test_facts_of_the_simulator_are_those_once_named_by_hand(task: str) -> None:
             assert fact.changed is None or fact.frames[0] < fact.changed < former.frames
         if difficulty == "hard" and task.endswith("UnmaskSwap"):
             assert any(fact.changed is not None for fact in facts), "a swap moves a cube"
-
-
-def test_facts_that_an_earlier_version_wrote_are_read() -> None:
-    fact = Fact("swap 1", "a and b", (3, 9), (12,), changed=15)
-    content = fact.to_dict()
-    assert Fact.from_dict(content) == fact
-    content["shown"] = content.pop("frames")
-    assert Fact.from_dict(content) == fact
-
-
-@pytest.mark.parametrize("former", ["evidence", "shown_facts"])
-def test_a_task_with_a_former_method_is_refused(former: str) -> None:
-    pytest.importorskip(
-        "mani_skill", reason="the simulator is not installed: the extra `sim` has it"
-    )
-    from mme_vla import Task
-
-    with pytest.raises(
-        UserError, match=rf"Old\.{former} is not read any more: define visible_facts"
-    ):
-        type("Old", (Task,), {former: lambda self, ended: set()})
 
 
 @pytest.mark.slow

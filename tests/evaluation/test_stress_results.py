@@ -28,12 +28,6 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
     assert mine[0].interval.low < 100 == mine[0].interval.high and len(stress_figures(curves)) == 1
 
 
-def test_records_of_a_former_dial_still_have_a_curve() -> None:
-    curves = stress_curves([*records("test", [1, 0]), *records("stress:sessions=2", [0, 0])])
-    (points,) = curves.values()
-    assert [(point.turned, point.won) for point in points] == [(0, 1), (2, 0)]
-
-
 def test_two_configurations_of_one_name_have_a_curve_each() -> None:
     stress_records = []
     for composition, won in (("first", 1), ("second", 0)):

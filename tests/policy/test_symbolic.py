@@ -78,7 +78,7 @@ def test_a_prompt_that_reads_a_subgoal_needs_its_text(source):
     with pytest.raises(UserError, match=r"subgoal_text\.kind"):
         TrainingDataset([source], policy.processor)
     with pytest.raises(UserError, match="simple_subgoal"):
-        SubgoalText("simple")
+        SubgoalText.from_config({"kind": "simple"})
 
 
 def test_the_subgoal_of_an_episode_changes_its_actions():

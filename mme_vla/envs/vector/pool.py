@@ -25,7 +25,6 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, Unpack
 
-from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.base import environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_names, make_env
 from mme_vla.envs.observations import Include, RenderRequest
@@ -33,7 +32,7 @@ from mme_vla.envs.rows import SceneOptions
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import SceneError, UserError, listed, require, text_of
-from mme_vla.utils.processes import end_with_parent, signals_deferred
+from mme_vla.utils.processes import signals_deferred
 
 
 @dataclass(frozen=True)
@@ -267,8 +266,8 @@ class VecEnv:
 
     def _spawn(self) -> _Worker:
         connection, remote = self._context.Pipe()
-        work = (serve, imported_plugins(), remote, self._factory)
-        process = self._context.Process(target=begin, args=(settings(), *work), daemon=True)
+        arguments = (settings(), remote, self._factory)
+        process = self._context.Process(target=serve, args=arguments, daemon=True)
         with signals_deferred():
             process.start()
         remote.close()
@@ -328,10 +327,9 @@ class VecEnv:
         require(not self._closed, "The environments are closed; make new ones.")
 
 
-def serve(plugins: Sequence[str], connection: Any, factory: Callable[..., Any]) -> None:
+def serve(inherited: Any, connection: Any, factory: Callable[..., Any]) -> None:
     """The work of a worker process: run commands until `CLOSE` or the end of the connection."""
-    import_plugins(plugins)
-    end_with_parent()
+    begin(*inherited)  # `settings` of the process that started it
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)

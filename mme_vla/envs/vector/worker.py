@@ -10,13 +10,14 @@ import os
 import pickle
 import sysconfig
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from mme_vla import errors
-from mme_vla.config.plugins import imported_plugins
+from mme_vla.config.plugins import import_plugins, imported_plugins
+from mme_vla.utils.processes import end_with_parent
 
 PRELOADED = ["mme_vla.envs.task"]
 """Modules that simulating processes import before they begin; fixed when the first of them is
@@ -33,17 +34,18 @@ def simulating_processes() -> Any:
     return context
 
 
-def settings() -> dict[str, str]:
-    """The environment variables that a process is to begin with."""
-    return dict(os.environ)
+def settings() -> tuple[dict[str, str], Sequence[str]]:
+    """What a process is to `begin` with: environment variables, and plugins."""
+    return dict(os.environ), imported_plugins()
 
 
-def begin(variables: Mapping[str, str], work: Callable[..., Any], *arguments: Any) -> Any:
-    """Take the environment variables of the process that started this one, then do its work."""
+def begin(variables: Mapping[str, str], plugins: Sequence[str]) -> None:
+    """Take the `settings` of the process that started this one, and end with it."""
     gc.freeze()  # what a collection does not walk through stays shared between the processes
     os.environ.clear()
     os.environ.update(variables)
-    return work(*arguments)
+    end_with_parent()
+    import_plugins(plugins)
 
 
 _INSTALLED = (

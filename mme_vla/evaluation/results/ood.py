@@ -14,7 +14,7 @@ import numpy as np
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task, require_simulator
-from mme_vla.envs.metadata import BASE, HARD, SESSIONS, TWIN, read_variant
+from mme_vla.envs.metadata import BASE, HARD, TWIN, read_variant
 from mme_vla.envs.rows import OOD, TIERS
 from mme_vla.envs.scene_hash import scene_digest
 from mme_vla.errors import SceneError
@@ -234,14 +234,13 @@ def extrapolation(
     """Success against the amount of what grows, over all splits of a model: training, test, stress
     and OOD.
 
-    Twins, episodes after others, and scenes that cannot be built or are other ones here, are left
-    out.
+    Twins, and scenes that cannot be built or are other ones here, are left out.
     """
     counted = []
     amounts = []
     for record in merge(records, conflicts):
         variant = read_variant(record.split)
-        if variant is not None and (variant.twin or variant.dial == SESSIONS):
+        if variant is not None and variant.twin:
             continue
         if record.task not in AMOUNTS:
             continue

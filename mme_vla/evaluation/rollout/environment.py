@@ -27,7 +27,6 @@ from mme_vla.envs.base import OPTIONS, EpisodeEnv, Hold, environment, open_episo
 from mme_vla.envs.make import ROBOMME, make_env
 from mme_vla.envs.metadata import DEFAULT_STEPS, STICK_TASKS
 from mme_vla.envs.observations import Include, RenderRequest
-from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.envs.subtasks import Progress, process_score
 from mme_vla.errors import require
@@ -370,7 +369,7 @@ class ChunkEnv:
             process = score.to_dict()
             subtask = min(score.done + 1, score.of)
         oracle = None
-        if self._oracle and status == "ongoing" and (choice := oracle_of(self._env)) is not None:
+        if self._oracle and status == "ongoing" and (choice := self._env.oracle()) is not None:
             oracle = choice_action(self._robot.action, choice)
         report = Report(
             status=status,

@@ -106,11 +106,11 @@ class OraclePlayer(Player):
     needs_images = False
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        from mme_vla.envs.oracle import OracleStuckError, oracle_choice, oracle_of
+        from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 
         task = getattr(session.env, "task", None)
         if task is None:
-            choice = oracle_of(session.env)
+            choice = session.env.oracle()
             if choice is None:
                 raise UserError(
                     "player=oracle: this environment has no oracle. Give it a method oracle(),"

@@ -25,7 +25,6 @@ from mme_vla.envs.facts import Candidates
 from mme_vla.envs.make import make_env, make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.robomme.recording.frames import motions_of
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError, require, text_of
@@ -299,7 +298,7 @@ def _read(running: RunningEpisode) -> None:
 def _script(base: Any, spec: EpisodeSpec, robot: Embodiment) -> Iterator[np.ndarray]:
     """Actions [w] of a demonstrator, one for each step that the caller performs in between."""
     if robot.action.space == CHOICES:
-        while (choice := oracle_of(base)) is not None:
+        while (choice := base.oracle()) is not None:
             yield choice_action(robot.action, choice)
     elif isinstance(base, EpisodeEnv):
         for action in base.environment.demonstrate(base.env):

@@ -14,7 +14,6 @@ from mme_vla.envs import make
 from mme_vla.envs.base import environment
 from mme_vla.envs.facts import Candidates
 from mme_vla.envs.make import make_env
-from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError, UserError
 from mme_vla.evaluation.records import RunKey
@@ -209,7 +208,7 @@ def check_script(task: str, folder: Path) -> None:
         return made[-1]
 
     def scripted(_: PlantedEpisode) -> np.ndarray:
-        choice = oracle_of(made[-1])
+        choice = made[-1].oracle()
         assert choice is not None
         return choice_action(CHOICE_SPACE, choice)[None]
 

@@ -53,18 +53,13 @@ class TaskCoverage:
     episodes: int = 0
     missing: dict[str, list[int]] = field(default_factory=dict)
 
-    @property
-    def missing_episodes(self) -> int:
-        """How many episodes have a goal that was never demonstrated."""
-        return sum(map(len, self.missing.values()))
-
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
         return {
             "goals": self.goals,
             "goals_covered": self.goals - len(self.missing),
             "episodes": self.episodes,
-            "episodes_covered": self.episodes - self.missing_episodes,
+            "episodes_covered": self.episodes - sum(map(len, self.missing.values())),
             "missing": self.missing,
         }
 
@@ -95,11 +90,10 @@ def in_words(coverage: Mapping[str, TaskCoverage]) -> str:
     """A line a task, and the missing goals of the split `test` under it."""
     lines = []
     for name, task in coverage.items():
-        covered = task.goals - len(task.missing)
-        episodes = task.episodes - task.missing_episodes
+        counts = task.to_dict()
         lines.append(
-            f"{name}: {covered} of {task.goals} goals of 'test', {episodes} of {task.episodes}"
-            " episodes"
+            f"{name}: {counts['goals_covered']} of {task.goals} goals of 'test',"
+            f" {counts['episodes_covered']} of {task.episodes} episodes"
         )
         for goal, numbers in task.missing.items():
             lines.append(f"  never shown: {goal} (episode {listed(numbers, 5)})")

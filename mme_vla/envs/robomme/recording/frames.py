@@ -61,17 +61,6 @@ class FrameChoice:
         if self.memory is not None:
             _build(self.memory)
 
-    def beforehand(self) -> RenderRequest | None:
-        """The request, where it does not depend on the demonstration: numbers without a memory;
-        else None.
-        """
-        if isinstance(self.at, int) or self.at in (DECISIONS, CHOICES) or self.memory is not None:
-            return None
-        numbers: set[int] = set()
-        for span in spans(self.at, "frames", GRAMMAR):
-            numbers.update(span)
-        return RenderRequest(dict.fromkeys(CAMERAS, frozenset(numbers)), now=())
-
     def render_request(self, steps: Sequence["RecordedStep"]) -> RenderRequest:
         """The request for a demonstration whose steps are known from a recording without images."""
         video = _video(steps)

@@ -204,16 +204,12 @@ class RecordingPlan:
     def write_facts(self, episodes: Path) -> None:
         """Write the table of facts of each place that has none, from what is known in `episodes` of
         every episode.
-
-        There is no table where an earlier version, which knew no facts, recorded an episode.
         """
         if not all((episodes / f"{job.name}.json").is_file() for job in self.jobs):
             return
         facts = {}
         for job in self.jobs:
             known = read_json(episodes / f"{job.name}.json", "what is known of a recorded episode")
-            if "facts" not in known:
-                return
             facts[job.name] = [Fact.from_dict(fact) for fact in known["facts"]]
         for place in self.places:
             if place == self.dataset:

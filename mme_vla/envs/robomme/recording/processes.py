@@ -5,9 +5,8 @@ import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 
-from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.utils.processes import end_with_parent, signals_deferred
+from mme_vla.utils.processes import signals_deferred
 
 
 def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> Iterator[R]:
@@ -38,11 +37,4 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
 
 def simulation_pool(workers: int) -> ProcessPoolExecutor:
     """Processes that simulate, end with this one, and know the same plugins."""
-    begun = (settings(), _begin_worker, imported_plugins())
-    return ProcessPoolExecutor(workers, simulating_processes(), begin, begun)
-
-
-def _begin_worker(plugins: Sequence[str]) -> None:
-    """A worker process ends with the one that started it, and knows the same tasks."""
-    end_with_parent()
-    import_plugins(plugins)
+    return ProcessPoolExecutor(workers, simulating_processes(), begin, settings())

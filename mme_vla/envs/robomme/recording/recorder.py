@@ -127,19 +127,18 @@ class Recorder:
         self._render = render
         self._on_step = on_step
         self._render_request = render_request
-        include = Include(
-            front_depth=render,
-            wrist_depth=render,
-            front_camera_extrinsic=True,
-            wrist_camera_extrinsic=True,
-        )
-        self._observer = Observer(task, include, render)
 
     def record(self) -> Recording:
         """Reset the task and demonstrate it once."""
         task = self._task
         task.reset()
-        self._observer.start()
+        include = Include(
+            front_depth=self._render,
+            wrist_depth=self._render,
+            front_camera_extrinsic=True,
+            wrist_camera_extrinsic=True,
+        )
+        self._observer = Observer(task, include, self._render)
         self._planned = Grounding(retry=False)
         # unlike a running environment's, a file's text is made once
         self._online = Grounding(retry=False)

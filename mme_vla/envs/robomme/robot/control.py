@@ -16,7 +16,7 @@ from mme_vla.envs.robomme.robot.kinematics import Arm
 from mme_vla.envs.robomme.robot.planning import plan_free, plan_screw
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robomme.scene.stage import Stage
+    from mme_vla.envs.task import Task
 
 OPEN, CLOSE = 1.0, -1.0
 """Gripper commands."""
@@ -49,7 +49,7 @@ class RobotControl:
 
     def __init__(
         self,
-        env: "Stage",
+        env: "Task",
         step: Callable[[np.ndarray], object],
         on_waypoint: Callable[[sapien.Pose, float], None] | None = None,
     ) -> None:
@@ -63,7 +63,7 @@ class RobotControl:
         """
         self.and_then = 0
         """Steps that the caller will add to the motion under way."""
-        self._step = step
+        self.step = step
         self._on_waypoint = on_waypoint
 
     def move_to(self, pose: sapien.Pose, gripper: float | None = None) -> None:
@@ -167,4 +167,4 @@ class RobotControl:
 
     def _command(self, joints: np.ndarray) -> None:
         arm = np.asarray(joints, np.float64)[:ARM_JOINTS]
-        self._step(arm if self.env.stick else np.append(arm, self.gripper))
+        self.step(arm if self.env.stick else np.append(arm, self.gripper))
