@@ -210,7 +210,7 @@ def test_events_are_matched_with_the_same_scenes() -> None:
     row = dict(zip(table.columns, table.rows[0], strict=True))
     assert (row["pairs"], row["lost"]) == ("2", "2") and "2 episodes not paired" in table.notes[0]
     (points,) = event_curves(every).values()
-    assert [point.episodes for point in points] == [2, 2]
+    assert [point.episodes for point in points.values()] == [2, 2]
 
 
 def test_twins_are_the_same_scenes() -> None:
