@@ -29,11 +29,11 @@ from mme_vla.weights.tables import Adapter
 from mme_vla.weights.writers import check_target, write_policy
 
 
-def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
+def print_mapping(policy: Policy, source: Source, to: str) -> None:
     """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered
     layers are one row.
     """
-    console = console or Console(width=None if sys.stdout.isatty() else 200)
+    console = Console(width=None if sys.stdout.isatty() else 200)
     names = formats()
     console.print(
         f"{source.folder} ({names[source.format]}) → {names[to]}; every tensor fits.",

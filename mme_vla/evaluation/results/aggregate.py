@@ -21,7 +21,7 @@ from mme_vla.evaluation.records import (
     EpisodeKey,
     EpisodeRecord,
     RunKey,
-    by_run,
+    check_settings,
     count_outcomes,
     merge,
 )
@@ -169,10 +169,6 @@ class Method:
         """The runs of each training; all in one group where records do not name their training."""
         return by_training(self.runs)
 
-    @property
-    def complete(self) -> bool:
-        return all(run.complete for run in self.runs)
-
     @cached_property
     def success(self) -> pd.DataFrame:
         """Success of every episode, a column for each of `runs` by its number: 1, 0, or NaN where
@@ -289,7 +285,7 @@ def aggregate(
         f" {'; '.join(listed)}.",
     )
     _check_environments(included)
-    by_run(included)  # refuses runs of mixed settings
+    check_settings(included)
     table = record_table(included)
     table["method"] = table["run"].map(_method_key)
     methods = [_method(members, protocol) for _, members in table.groupby("method", sort=False)]
