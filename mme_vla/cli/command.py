@@ -118,11 +118,20 @@ def _checked_arguments(
     words: Sequence[str], config_name: str, tree: Path, check: str
 ) -> argparse.Namespace:
     """Hydra's options and overrides on a command line, in any order."""
-    try:
-        args, unknown = _parser().parse_known_intermixed_args(words)
-    except _ParserError as error:
-        # an option with too few words, or the beginning of several
-        raise _explained(error, words, _names(config_name, tree, [])) from None
+
+    def refuse(message: str) -> NoReturn:
+        """An option with too few words, or the beginning of several."""
+        names = _names(config_name, tree, [])
+        for word in words:
+            option = word.partition("=")[0]
+            if option.startswith("--") and option not in names.options:
+                raise unknown_option(word, words, names)
+        # such as "argument --config-dir/-cd: expected one argument"
+        raise UserError(f"{message.capitalize()}. --help lists the options.")
+
+    parser = get_args_parser()
+    parser.error = refuse  # type: ignore[method-assign]
+    args, unknown = parser.parse_known_intermixed_args(words)
     if unknown:
         raise unknown_option(unknown[0], words, _names(config_name, tree, []))
     require(not args.experimental_rerun, "--experimental-rerun reads pickled runs: there are none.")
@@ -178,30 +187,6 @@ def _other_commands(words: Sequence[str], names: Names) -> str:
         if users:
             text += f" {key!r} is a key of {', '.join(users)}."
     return text
-
-
-class _ParserError(Exception):
-    """What Hydra's parser of options says of a command line."""
-
-
-def _parser() -> argparse.ArgumentParser:
-    """Hydra's parser of options, which raises instead of printing its usage."""
-
-    def refuse(message: str) -> NoReturn:
-        raise _ParserError(message)
-
-    parser = get_args_parser()
-    parser.error = refuse  # type: ignore[method-assign]
-    return parser
-
-
-def _explained(error: _ParserError, words: Sequence[str], names: Names) -> UserError:
-    for word in words:
-        option = word.partition("=")[0]
-        if option.startswith("--") and option not in names.options:
-            return unknown_option(word, words, names)
-    # such as "argument --config-dir/-cd: expected one argument"
-    return UserError(f"{str(error).capitalize()}. --help lists the options.")
 
 
 def _names(config_name: str, tree: Path, extra_dirs: Sequence[Path]) -> Names:
