@@ -273,7 +273,8 @@ def test_own_tasks_form_a_group_beside_the_benchmark() -> None:
     both = aggregate([*benchmark, *custom], Protocol(tasks, 2, samples=100))
     (method,) = both.methods
     assert (method.average.mean, method.figures["suite"]["Own tasks"].mean) == (50.0, 75.0)
-    assert method.figures["task"]["TwoButtons"].mean == 100.0 and method.complete
+    assert method.figures["task"]["TwoButtons"].mean == 100.0
+    assert all(run.complete for run in method.runs)
     assert both.notes == []
     assert tasks_of([*benchmark, *custom]) == (*PAPER_ORDER, "Stay", "TwoButtons")
 
