@@ -581,7 +581,7 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
         ),
         ({"memory": {"budget": 64}, "card": {"recipe": {}}}, "memory without a name, 64 tokens"),
         (
-            {"memory": "ttt", "integration": "expert", "card": "manually"},
+            {"memory": {"name": "ttt"}, "integration": {"name": "expert"}},
             "memory ttt, integration expert",
         ),
         ({"card": {"recipe": "as released"}}, "training: as released"),
