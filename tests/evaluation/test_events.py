@@ -405,7 +405,7 @@ def test_results_pair_events_with_their_matched_arms(
         (2, 1, 2),
     ]
     pairs = matched_methods(aggregate(made, Protocol(("PickXtimes",), episodes=2)))
-    assert {(first.event, second.event) for first, second in pairs} == {
+    assert {(first.key.event, second.key.event) for first, second in pairs} == {
         (event, None) for event in ("pause:50", "pause:100", "speed:2", "pause:50@subtask:9")
     }
     save_records(tmp_path, made)

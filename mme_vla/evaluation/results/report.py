@@ -281,9 +281,9 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
                 settings = content["settings"]
                 notes = content.get("notes") or {}
                 is_same = (
-                    settings.get("model") == method.model
+                    settings.get("model") == method.key.model
                     and checkpoint_number(settings.get("checkpoint", "")) == checkpoint
-                    and method.composition in (notes.get("composition"), None)
+                    and method.key.composition in (notes.get("composition"), None)
                 )
                 if is_same and notes.get("policy"):
                     facts = notes["policy"]

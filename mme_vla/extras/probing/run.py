@@ -312,15 +312,17 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
         return []
     protocol = Protocol.of_records(records)
     methods = aggregate(records, protocol, split).methods
-    unprobed = [method for method in methods if method.model == model and method.event is None]
+    unprobed = [
+        method for method in methods if method.key.model == model and method.key.event is None
+    ]
     baseline = unprobed[0] if unprobed else None
     for method in methods:
         if method is baseline:
             method.label = UNPROBED.name
-        elif method.event is not None:
-            method.label = f"event {method.event}"
+        elif method.key.event is not None:
+            method.label = f"event {method.key.event}"
         else:
-            method.label = method.model.removeprefix(f"{model}{ARM}")
+            method.label = method.key.model.removeprefix(f"{model}{ARM}")
     if baseline is None:
         return []
     pairs = []
