@@ -565,7 +565,7 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
     main(options)
     printed = capsys.readouterr().out
     assert "50.0 (2 of 4)" in printed
-    assert "pi05 and ttt_modul have no episode in common, and are not compared." in printed
+    assert "pi05 and ttt_modul have no episode in common: there is nothing to pair." in printed
     with pytest.raises(SystemExit) as ended:
         main([*options, "--compare", "pi05", "ttt_modul"])
     assert ended.value.code == 2

@@ -139,11 +139,6 @@ def pair_methods(first: Method, second: Method) -> Pairing[EpisodeKey]:
     return pair([run.episodes for run in (*first.runs, *second.runs)])
 
 
-def common_episodes(first: Method, second: Method) -> set[EpisodeKey]:
-    """The episodes that `compare` pairs."""
-    return set(pair_methods(first, second).keys)
-
-
 def why_unpaired(first: Method, second: Method) -> str:
     """Why no episode of two methods can be paired, in a sentence or two."""
     what = f"{first.label} and {second.label}"

@@ -18,7 +18,7 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import ARM, EpisodeRecord, RunKey, display_name
 from mme_vla.evaluation.results.aggregate import aggregate
-from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.compare import Comparison, compare_all, pair_methods
 from mme_vla.evaluation.results.events import idle_events
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import (
@@ -327,6 +327,6 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
         return []
     pairs = []
     for method in methods:
-        if method is not baseline and common_episodes(method, baseline):
+        if method is not baseline and pair_methods(method, baseline).keys:
             pairs.append((method, baseline))
     return compare_all(pairs, protocol)
