@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from mme_vla.cli.gallery import Snapshot, demonstrated
+from mme_vla.cli.gallery import demonstrated
 from mme_vla.envs.episodes import choose_episodes
 from mme_vla.utils import write_atomically
-from mme_vla.utils.media import BORDER, RED, evenly_spaced
+from mme_vla.utils.media import BORDER, RED, Tile, evenly_spaced
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "benchmark" / "gallery"
 SIDE, FRAMES, LIMIT = 192, 48, 150_000  # pixels, frames, bytes
@@ -33,11 +33,12 @@ def bordered(image: np.ndarray) -> np.ndarray:
     return framed
 
 
-def encode(snapshots: list[Snapshot]) -> bytes:
-    """Return the snapshots as a looping WebP of at most `LIMIT` bytes."""
-    chosen = [snapshots[i] for i in evenly_spaced(len(snapshots), min(FRAMES, len(snapshots)))]
+def encode(views: list[Tile]) -> bytes:
+    """Return the views as a looping WebP of at most `LIMIT` bytes."""
+    chosen = [views[i] for i in evenly_spaced(len(views), min(FRAMES, len(views)))]
     images = [
-        Image.fromarray(bordered(shot.image) if shot.video else shot.image) for shot in chosen
+        Image.fromarray(view.image if view.outline is None else bordered(view.image))
+        for view in chosen
     ]
     images = [image.resize((SIDE, SIDE), Image.Resampling.LANCZOS) for image in images]
     durations = [DURATION] * (len(images) - 1) + [LAST]
@@ -70,10 +71,10 @@ def main() -> None:
         path = options.output / f"{spec.task}.webp"
         if path.is_file():
             continue
-        env, snapshots = demonstrated(spec)
+        env, views = demonstrated(spec)
         env.close()
         with write_atomically(path) as draft:
-            draft.write_bytes(encode(snapshots))
+            draft.write_bytes(encode(views))
         print(f"{path}: {path.stat().st_size:,} bytes", flush=True)
 
 

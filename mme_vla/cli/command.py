@@ -14,7 +14,8 @@ from typing import ClassVar, NoReturn
 
 import hydra
 import yaml
-from hydra._internal.utils import get_args_parser
+from hydra import version
+from hydra._internal.utils import _run_hydra, get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
@@ -61,15 +62,15 @@ def run_configured(
         check: `module:function` that is given the plain configuration before `main` is called.
     """
     tree = directory or config_dir()
-    sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
+    words = several_memories(plugins.trust_as_override(sys.argv[1:]))
 
     @functools.wraps(main)  # Hydra names the job after the module
     def job(cfg: DictConfig) -> object:
         with print_user_errors():
             # here too: Hydra would print a traceback before it gets further
             if missing := sorted(OmegaConf.missing_keys(cfg)):
-                words = " ".join(f"{key}=…" for key in missing)
-                raise UserError(f"A value is needed for {', '.join(missing)}: add {words}")
+                needed = " ".join(f"{key}=…" for key in missing)
+                raise UserError(f"A value is needed for {', '.join(missing)}: add {needed}")
             join_memories(cfg)
             hydra_cfg = HydraConfig.get()
             name = str(hydra_cfg.job.config_name)
@@ -80,15 +81,14 @@ def run_configured(
             return main(cfg)
 
     with print_user_errors():
-        _check_command_line(config_name, tree, check)
-        start = hydra.main(
-            version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name
-        )
+        args = _checked_arguments(words, config_name, tree, check)
+        version.setbase(VERSION_BASE)
         # Hydra makes the run folder: what the disk says to that is to come here, not to be printed
         # there.
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")
         try:
-            start(job)()
+            # `hydra.main` would parse the words again, and refuse options behind overrides.
+            _run_hydra(args, get_args_parser(), job, str(tree.resolve()), config_name)
         except HydraException as error:
             raise UserError(str(error)) from error
         except SystemExit as ended:
@@ -114,32 +114,27 @@ class NewFolders(Callback):
         NewFolders.made = [path for path in (folder, *folder.parents) if not path.exists()]
 
 
-def options_first(words: Sequence[str]) -> list[str]:
-    """Move the options of a command line before its overrides: Hydra's parser takes no other order.
+def _checked_arguments(
+    words: Sequence[str], config_name: str, tree: Path, check: str
+) -> argparse.Namespace:
+    """Hydra's options and overrides on a command line, in any order."""
 
-    A command line with an unknown option stays as it is.
-    """
-    try:
-        args, unknown = _parser().parse_known_intermixed_args(words)
-    except _ParserError:
-        return list(words)  # `_check_command_line` says what is wrong
+    def refuse(message: str) -> NoReturn:
+        """An option with too few words, or the beginning of several."""
+        names = _names(config_name, tree, [])
+        for word in words:
+            option = word.partition("=")[0]
+            if option.startswith("--") and option not in names.options:
+                raise unknown_option(word, words, names)
+        # such as "argument --config-dir/-cd: expected one argument"
+        raise UserError(f"{message.capitalize()}. --help lists the options.")
+
+    parser = get_args_parser()
+    parser.error = refuse  # type: ignore[method-assign]
+    args, unknown = parser.parse_known_intermixed_args(words)
     if unknown:
-        return list(words)
-    options = list(words)
-    options.reverse()
-    for override in reversed(args.overrides):
-        options.remove(override)  # its last occurrence: the value of an option may be the same word
-    return [*reversed(options), *args.overrides]
-
-
-def _check_command_line(config_name: str, tree: Path, check: str) -> None:
-    try:
-        args, unknown = _parser().parse_known_intermixed_args()
-    except _ParserError as error:
-        # an option with too few words, or the beginning of several
-        raise _explained(error, _names(config_name, tree, [])) from None
-    if unknown:
-        raise unknown_option(unknown[0], sys.argv[1:], _names(config_name, tree, []))
+        raise unknown_option(unknown[0], words, _names(config_name, tree, []))
+    require(not args.experimental_rerun, "--experimental-rerun reads pickled runs: there are none.")
     modes = []
     for mode in ("run", "multirun", "cfg", "info", "shell_completion"):
         if getattr(args, mode):
@@ -153,8 +148,8 @@ def _check_command_line(config_name: str, tree: Path, check: str) -> None:
             trees = list(library_trees())
         print(help_page(args.config_name or config_name, args.overrides, [*trees, *extra]))
         raise SystemExit(0)
-    if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
-        return  # nothing of this tree is composed
+    if args.hydra_help or args.shell_completion or args.config_path:
+        return args  # nothing of this tree is composed
     _check_bare_words(args.overrides, args.config_name or config_name, tree, extra)
     name = args.config_name or config_name
     try:
@@ -174,6 +169,7 @@ def _check_command_line(config_name: str, tree: Path, check: str) -> None:
             values = resolved(cfg)
             if not OmegaConf.missing_keys(cfg):
                 pkgutil.resolve_name(check)(values)
+    return args
 
 
 def _other_commands(words: Sequence[str], names: Names) -> str:
@@ -191,30 +187,6 @@ def _other_commands(words: Sequence[str], names: Names) -> str:
         if users:
             text += f" {key!r} is a key of {', '.join(users)}."
     return text
-
-
-class _ParserError(Exception):
-    """What Hydra's parser of options says of a command line."""
-
-
-def _parser() -> argparse.ArgumentParser:
-    """Hydra's parser of options, which raises instead of printing its usage."""
-
-    def refuse(message: str) -> NoReturn:
-        raise _ParserError(message)
-
-    parser = get_args_parser()
-    parser.error = refuse  # type: ignore[method-assign]
-    return parser
-
-
-def _explained(error: _ParserError, names: Names) -> UserError:
-    for word in sys.argv[1:]:
-        option = word.partition("=")[0]
-        if option.startswith("--") and option not in names.options:
-            return unknown_option(word, sys.argv[1:], names)
-    # such as "argument --config-dir/-cd: expected one argument"
-    return UserError(f"{str(error).capitalize()}. --help lists the options.")
 
 
 def _names(config_name: str, tree: Path, extra_dirs: Sequence[Path]) -> Names:

@@ -202,7 +202,7 @@ def report(done: Evaluation) -> None:
     is_scored = total_score(done.records) is not None
     columns = ["task", "episodes", *OUTCOMES, "success rate"]
     if is_scored:
-        columns += ["right subgoals", "points off by"]
+        columns += ["right subgoals (%)", "points off by (pixels)"]
     table = Table(*columns)
     by_task: dict[str, list[EpisodeRecord]] = {}
     for record in done.records:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from omegaconf import DictConfig
 from PIL.Image import Image
 
@@ -15,8 +14,7 @@ from mme_vla.data.console import progress
 from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
-from mme_vla.envs.observations import Include, Observer
-from mme_vla.envs.subtasks import NO_RECORD
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import UserError, counted, require
 from mme_vla.utils import read_text
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
@@ -27,57 +25,34 @@ if TYPE_CHECKING:  # it imports the simulator, which is asked for first
 
 MADE = "Made by `mme-vla gallery`."  # stands on each page
 COLUMNS = 4  # images a row
-EVERY = 8  # Steps between two images that are taken; which of them are shown is decided at the end
+EVERY = 8  # steps between two images that are taken; which are shown is decided at the end
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """The front view at one step."""
-
-    step: int
-    image: np.ndarray
-    subtask: str
-    video: bool
-
-
-def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
-    """Demonstrate a task, with an image every few steps; also returns whether it succeeded."""
-    from mme_vla.envs.robomme.recording.recorder import demonstrate
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-
-    task.reset()
-    observer = Observer(task, Include(), render=True)
-    snapshots: list[Snapshot] = []
-
-    def capture(evaluated: dict[str, Any]) -> None:
-        observer.follow()
-        subtask = task.progress.displayed
-        if task.steps_done % every == 1 and subtask.text != NO_RECORD:
-            image = observer.frame(evaluated)["front_rgb"]
-            snapshots.append(Snapshot(task.steps_done, image, subtask.text, subtask.video))
-
-    task.on_frame = capture
-    try:
-        success = demonstrate(
-            task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32)))
-        )
-    finally:
-        task.on_frame = None
-    return snapshots, success
-
-
-def strip(snapshots: Sequence[Snapshot], tiles: int) -> Image:
-    """Some of the snapshots side by side, spread evenly, each with its step; video frames have a
-    red border.
+def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Tile], bool]:
+    """Demonstrate a task, with a front view of every few steps, each with its step; views of the
+    video have a red border. Also returns whether it succeeded.
     """
-    images = []
-    for i in evenly_spaced(len(snapshots), tiles):
-        shot = snapshots[i]
-        if shot.video:
-            images.append(Tile(shot.image, f"video, step {shot.step}", RED))
+    from mme_vla.envs.robomme.recording.recorder import RecordedStep, Recorder
+
+    views: list[Tile] = []
+
+    def keep_view(step: RecordedStep) -> None:
+        image = step.obs.get("front_rgb")
+        if image is None:  # a step between
+            return
+        if step.info["is_video_demo"]:
+            views.append(Tile(image, f"video, step {task.steps_done}", RED))
         else:
-            images.append(Tile(shot.image, f"step {shot.step}"))
-    return contact_sheet(images, COLUMNS)
+            views.append(Tile(image, f"step {task.steps_done}"))
+
+    request = RenderRequest({"front": range(0, 2**31, every)})
+    recording = Recorder(task, on_step=keep_view, render_request=request).record()
+    return views, recording.success
+
+
+def strip(views: Sequence[Tile], tiles: int) -> Image:
+    """Some of the views side by side, spread evenly."""
+    return contact_sheet([views[i] for i in evenly_spaced(len(views), tiles)], COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -111,10 +86,10 @@ def main(cfg: DictConfig) -> None:
     entries = []
     with progress("show", len(specs), unit="tasks") as advance:
         for spec in specs:
-            env, snapshots = demonstrated(spec)
+            env, views = demonstrated(spec)
             several = sum(other.task == spec.task for other in specs) > 1
             image_name = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
-            strip(snapshots, gallery.tiles).save(folder / image_name, quality=82)
+            strip(views, gallery.tiles).save(folder / image_name, quality=82)
             entries.append((spec.task, env.goals()[0], image_name))
             env.close()
             advance(1)
@@ -124,7 +99,7 @@ def main(cfg: DictConfig) -> None:
     print(f"{page}: {counted(len(entries), 'task')}.")
 
 
-def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
+def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Tile]]:
     """The first seed from the episode's on whose demonstration succeeds, as the official episodes
     were found.
     """
@@ -135,9 +110,9 @@ def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
             env = make_task(spec.task, render=True, **spec.options | {"seed": seed})
         except SceneError:
             continue
-        snapshots, success = demonstrate_with_images(env)
+        views, success = demonstrate_with_images(env)
         if success:
-            return env, snapshots
+            return env, views
         env.close()
     raise UserError(
         f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}."

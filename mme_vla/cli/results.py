@@ -21,7 +21,6 @@ from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.compare import (
     Comparison,
-    common_episodes,
     compare_all,
     pair_methods,
     why_unpaired,
@@ -371,25 +370,16 @@ def _pairs(
     """
     if requested is not None:
         return [(results.method(first), results.method(second)) for first, second in requested]
-    matched = matched_methods(results)
+    candidates = matched_methods(results)
+    if not candidates and len(results.methods) == 2:
+        candidates = [(results.methods[0], results.methods[1])]
     pairs = []
-    for pair in matched:
-        if common_episodes(*pair):
+    for pair in candidates:
+        if pair_methods(*pair).keys:
             pairs.append(pair)
         else:
             results.notes.append(why_unpaired(*pair))
-    if matched:
-        return pairs
-    if len(results.methods) != 2:
-        return []
-    first, second = results.methods
-    if common_episodes(first, second):
-        return [(first, second)]
-    reasons = pair_methods(first, second).notes(f"{first.label} and {second.label}")
-    results.notes += reasons or [
-        f"{first.label} and {second.label} have no episode in common, and are not compared."
-    ]
-    return []
+    return pairs
 
 
 def _verify_parser() -> argparse.ArgumentParser:

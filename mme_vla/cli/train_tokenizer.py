@@ -19,8 +19,8 @@ from mme_vla.errors import UserError, require
 VOCAB_SIZE = 1024
 
 
-def train_tokenizer(sentences: Iterable[str], vocab_size: int = VOCAB_SIZE) -> bytes:
-    """Return a SentencePiece model of `vocab_size` pieces made from these sentences."""
+def train_tokenizer(sentences: Iterable[str]) -> bytes:
+    """Return a SentencePiece model of `VOCAB_SIZE` pieces made from these sentences."""
     from sentencepiece import SentencePieceTrainer
 
     model = io.BytesIO()
@@ -29,7 +29,7 @@ def train_tokenizer(sentences: Iterable[str], vocab_size: int = VOCAB_SIZE) -> b
             sentence_iterator=iter(sentences),
             model_writer=model,
             model_type="bpe",
-            vocab_size=vocab_size,
+            vocab_size=VOCAB_SIZE,
             pad_id=0,
             eos_id=1,
             bos_id=2,
@@ -46,7 +46,7 @@ def train_tokenizer(sentences: Iterable[str], vocab_size: int = VOCAB_SIZE) -> b
             minloglevel=2,
         )
     except RuntimeError as error:
-        raise UserError(f"Could not train a tokenizer of {vocab_size} pieces: {error}.") from None
+        raise UserError(f"Could not train a tokenizer of {VOCAB_SIZE} pieces: {error}.") from None
     return model.getvalue()
 
 

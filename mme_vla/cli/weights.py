@@ -29,11 +29,11 @@ from mme_vla.weights.tables import Adapter
 from mme_vla.weights.writers import check_target, write_policy
 
 
-def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
+def print_mapping(policy: Policy, source: Source, to: str) -> None:
     """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered
     layers are one row.
     """
-    console = console or Console(width=None if sys.stdout.isatty() else 200)
+    console = Console(width=None if sys.stdout.isatty() else 200)
     names = formats()
     console.print(
         f"{source.folder} ({names[source.format]}) → {names[to]}; every tensor fits.",
@@ -50,10 +50,6 @@ def print_mapping(policy: Policy, source: Source, to: str, console: Console | No
 def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: str) -> None:
     state = policy.state_dict()
     shapes = adapter.shapes(state)
-    table = _table(f"{title}: {len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours")
-    for column in ("theirs", "shape", "layout", "ours"):
-        table.add_column(column, overflow="fold")
-    table.add_column("tensors", overflow="fold", justify="right")
     rows: dict[tuple[str, ...], int] = {}
     for target, pieces in adapter.table.items():
         for piece in pieces:
@@ -62,9 +58,13 @@ def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: st
             layout = "" if left.strip() == right.strip() else piece.pattern
             cells = (_starred(piece.path), _shape(shapes[piece.path]), layout, _starred(target))
             rows[cells] = rows.get(cells, 0) + 1
-    for row, count in rows.items():
-        table.add_row(*row, str(count))
-    console.print(table)
+    counts = f"{len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours"
+    _print_list(
+        console,
+        f"{title}: {counts}",
+        [(*row, str(count)) for row, count in rows.items()],
+        ("theirs", "shape", "layout", "ours", "tensors"),
+    )
     gaps = []
     for gap in adapter.unread:
         part = "whole" if gap.layer is None else f"layer {gap.layer}"
@@ -87,16 +87,12 @@ def _print_list(
     if not rows:
         console.print(f"{title}: none")
         return
-    table = _table(title)
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for column in columns:
         table.add_column(column, overflow="fold")
     for row in rows:
         table.add_row(*row)
     console.print(table)
-
-
-def _table(title: str) -> Table:
-    return Table(title=title, title_justify="left", box=None, pad_edge=False)
 
 
 def _starred(name: str) -> str:

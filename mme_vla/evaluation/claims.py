@@ -5,7 +5,7 @@ import json
 import os
 import re
 import socket
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -56,18 +56,12 @@ def check_sharing(folder: Path, records: str) -> None:
             )
 
 
-def choose_shard(text: str | None, variables: Mapping[str, str] | None = None) -> Shard:
-    """Read `0/4` (the first of four), or the rank of this process under torchrun.
-
-    text: wins over them.
-    variables: of the environment; None: the process's own.
-    """
-    if variables is None:
-        variables = os.environ
+def choose_shard(text: str | None) -> Shard:
+    """Read `0/4` (the first of four); without a text, the rank of this process under torchrun."""
     if text is None:
-        if "RANK" not in variables or "WORLD_SIZE" not in variables:
+        if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
             return Shard()
-        text = f"{variables['RANK']}/{variables['WORLD_SIZE']}"
+        text = f"{os.environ['RANK']}/{os.environ['WORLD_SIZE']}"
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
     if match is None or int(match[1]) >= int(match[2]):
         raise UserError(

@@ -420,27 +420,26 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
     return completed
 
 
-def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:
-    """Group merged records."""
-    runs: dict[RunKey, list[EpisodeRecord]] = {}
+def check_settings(records: Iterable[EpisodeRecord]) -> None:
+    """Make sure that a run has one action space, one step limit, and an environment for each task.
+
+    Raises:
+        UserError: its records name several.
+    """
+    values: dict[tuple[RunKey, str, str], set[Any]] = {}
     for record in records:
-        runs.setdefault(record.run, []).append(record)
-    for run, members in runs.items():
-        of_one: dict[tuple[str, str], set[Any]] = {}
-        for member in members:
-            of_one.setdefault(("action_space", ""), set()).add(member.action_space)
-            # Tasks of other environments may have limits of their own.
-            scope = "" if member.env in (None, ROBOMME) else member.task
-            if member.env is not None:
-                of_one.setdefault(("env", member.task), set()).add(member.env)
-            of_one.setdefault(("max_steps", scope), set()).add(member.max_steps)
-        for (name, _), values in of_one.items():
-            if len(values) > 1:
-                raise UserError(
-                    f"{run} mixes {name} {' and '.join(map(str, sorted(values)))}: evaluate it"
-                    " with one of them."
-                )
-    return runs
+        # Tasks of other environments may have limits of their own.
+        scope = "" if record.env in (None, ROBOMME) else record.task
+        values.setdefault((record.run, "action_space", ""), set()).add(record.action_space)
+        values.setdefault((record.run, "max_steps", scope), set()).add(record.max_steps)
+        if record.env is not None:
+            values.setdefault((record.run, "env", record.task), set()).add(record.env)
+    for (run, name, _), different in values.items():
+        if len(different) > 1:
+            raise UserError(
+                f"{run} mixes {name} {' and '.join(map(str, sorted(different)))}: evaluate it"
+                " with one of them."
+            )
 
 
 def finished(records: Iterable[EpisodeRecord], retry_errors: bool = True) -> set[EpisodeKey]:

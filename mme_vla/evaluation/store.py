@@ -148,9 +148,9 @@ def write_new(target: Path, text: str) -> None:
         mine.unlink(missing_ok=True)
 
 
-def await_content(path: Path, patience: float = 2) -> None:
+def await_content(path: Path) -> None:
     # Without hard links another process may have made the file, but not filled it yet.
-    end = time.monotonic() + patience
+    end = time.monotonic() + 2
     while path.stat().st_size == 0 and time.monotonic() < end:
         time.sleep(0.05)
 

@@ -8,7 +8,7 @@ import ast
 import hashlib
 import inspect
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -134,6 +134,25 @@ class FrameScores:
         """Return only the rows of frames ≤ `step`."""
         count = int(np.searchsorted(self.frames, step, side="right"))
         return FrameScores(self.frames[:count], self.values[:count])
+
+
+def score_frames(
+    scorer: FrameScorer | None, images: Mapping[int, np.ndarray], patches: int
+) -> FrameScores:
+    """The scores of an episode's frames, in order.
+
+    Args:
+        images: number of a frame → RGB [H, W, 3] uint8.
+        patches: scores of a frame.
+    """
+    rows: dict[int, np.ndarray] = {}
+    for frame in sorted(images):
+        values = None if scorer is None else scorer(frame, images[frame])
+        if values is not None:
+            rows[frame] = np.asarray(values, np.float32)
+    if not rows:
+        return FrameScores.empty(patches)
+    return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
 
 
 class History:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.memory.base import Memory, check_scorer, stack_history
-from mme_vla.memory.history import CachedHistory, FrameScores, History, OnlineHistory
+from mme_vla.memory.history import CachedHistory, History, OnlineHistory, score_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -76,25 +76,12 @@ class Episode:
             length = self.length
         spec = self.memory.storage
         stored = spec.stored_frames(length)
+        images = dict(enumerate(self.images[:length]))
+        scores = score_frames(self.memory.make_scorer(), images, spec.grid**2)
         history = CachedHistory(
-            spec, self.tokens[stored].numpy(), stored, length, self._scores(length), self.exec_start
+            spec, self.tokens[stored].numpy(), stored, length, scores, self.exec_start
         )
         return self._with_motion(history)
-
-    def _scores(self, length: int) -> FrameScores | None:
-        """Scores of the first `length` frames; None where there are none."""
-        scorer = self.memory.make_scorer()
-        if scorer is None:
-            return None
-        frames, values = [], []
-        for frame in range(length):
-            row = scorer(frame, self.images[frame])
-            if row is not None:
-                frames.append(frame)
-                values.append(row)
-        if not frames:
-            return None
-        return FrameScores(np.array(frames), np.stack(values))
 
     def _with_motion(self, history: _Kind) -> _Kind:
         """The history with proprioception and actions, where its memory reads them."""

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.memory.base import padded_length
-from mme_vla.memory.history import CachedHistory, FrameScores
+from mme_vla.memory.history import CachedHistory, score_frames
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.processing.images import full_past
@@ -193,14 +193,5 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
     tokens = policy.encode_frames(frames[stored_frames])
     if tokens.dtype == torch.bfloat16:
         tokens = tokens.view(torch.uint16)
-    scored_frames, values = [], []
-    scorer = memory.make_scorer()
-    for t, frame in enumerate(frames):
-        row = None if scorer is None else scorer(t, frame)
-        if row is not None:
-            scored_frames.append(t)
-            values.append(row)
-    scores = None
-    if values:
-        scores = FrameScores(np.array(scored_frames), np.stack(values).astype(np.float32))
+    scores = score_frames(memory.make_scorer(), dict(enumerate(frames)), storage.grid**2)
     return CachedHistory(storage, tokens.numpy(), stored_frames, len(frames), scores, exec_start)

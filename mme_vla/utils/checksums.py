@@ -97,27 +97,19 @@ class Sums:
         self._compared |= set(paths)
 
 
-def check_sums(folder: Path, names: Collection[str] | None = None) -> bool:
+def check_sums(folder: Path, names: Collection[str]) -> None:
     """Compare files with the sums that were written beside them.
 
     Args:
         folder: a folder that may hold `SHA256SUMS`.
-        names: the files about to be read, each of which must be listed where there is a list; by
-            default all that are listed. Notes and cards that people add are not read, and need no
-            line.
-
-    Returns:
-        Whether there were sums to compare with.
+        names: the files about to be read, each of which must be listed where there is a list. Notes
+            and cards that people add are not read, and need no line.
 
     Raises:
         UserError: a file is damaged, missing, or not listed: it was added after the sums were
             written.
     """
     sums = Sums(folder)
-    if names is None:
-        sums.check(*sorted(sums.table))
-        return sums.there
-    names = list(names)
     added = [name for name in names if sums.there and name not in sums.table]
     if added:
         raise UserError(
@@ -126,7 +118,6 @@ def check_sums(folder: Path, names: Collection[str] | None = None) -> bool:
             f" line: sha256sum <file> >> {SUMS}"
         )
     sums.check(*names)
-    return sums.there
 
 
 def checked_file(folder: Path, name: str, what: str = "file") -> Path:

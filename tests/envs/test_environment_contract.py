@@ -23,7 +23,7 @@ from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector import worker
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, place_of, set_place, text_of
-from mme_vla.evaluation.records import EpisodeRecord, by_run
+from mme_vla.evaluation.records import EpisodeRecord, check_settings
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.tables import grouping_tables
 from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv
@@ -181,10 +181,10 @@ def records() -> list[EpisodeRecord]:
 
 
 def test_records_of_one_run_may_have_a_limit_of_each_task_but_not_two_of_one() -> None:
-    assert len(by_run(records())) == 1
+    check_settings(records())
     mixed = [*records(), EpisodeRecord("m", 1, 7, "Wide", 2, 2, "", "fail", 3, env="corridors")]
     with pytest.raises(UserError, match="mixes max_steps 9 and 1300"):
-        by_run(mixed)
+        check_settings(mixed)
 
 
 def test_results_make_a_table_of_each_grouping_from_the_records_alone() -> None:

@@ -207,20 +207,15 @@ def test_episodes_that_took_longest_begin_first() -> None:
 
 def test_the_forecast_follows_whoever_is_slower() -> None:
     durations = Durations([record(0, 3600)])
-    alone = durations.forecast(JOBS, workers=1)
-    assert alone.seconds == pytest.approx(4 * 0.75 * 3600)
-    many = durations.forecast(JOBS, workers=4)
-    assert many.seconds == pytest.approx(3600)  # the policy's quarter of each, one by one
-    shared = durations.forecast(JOBS * 10, workers=4, processes=2)
-    assert shared.seconds == pytest.approx(5 * 3600)
-    assert (
-        str(shared)
-        == "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1"
+    assert "about 3.0 h" in durations.forecast(JOBS, workers=1)  # three quarters of each
+    assert "about 1.0 h" in durations.forecast(JOBS, workers=4)  # the policy's, one by one
+    assert durations.forecast(JOBS * 10, workers=4, processes=2) == (
+        "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1"
         " before them did"
     )
     assert Durations([]).forecast(JOBS, workers=1) is None
     short = Durations([record(0, 4)]).forecast(JOBS[:1], workers=1)
-    assert str(short).startswith("forecast: about a minute at most for 1 episode, 1 at a time")
+    assert short.startswith("forecast: about a minute at most for 1 episode, 1 at a time")
 
 
 def test_an_episode_that_is_tried_again_comes_last() -> None:

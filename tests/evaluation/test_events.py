@@ -396,14 +396,16 @@ def test_results_pair_events_with_their_matched_arms(
         "100.0",
         "50.0",
     ]
-    curves = {dial: [(p.turned, p.won, p.episodes) for p in points] for (_, _, dial), points in
-              event_curves(made).items()}  # fmt: skip
+    curves = {
+        dial: [(at, p.won, p.episodes) for at, p in points.items()]
+        for (_, _, dial), points in event_curves(made).items()
+    }
     assert curves["pause"] == [(0, 2, 2), (50, 1, 2), (100, 0, 2)] and curves["speed"] == [
         (1, 2, 2),
         (2, 1, 2),
     ]
     pairs = matched_methods(aggregate(made, Protocol(("PickXtimes",), episodes=2)))
-    assert {(first.event, second.event) for first, second in pairs} == {
+    assert {(first.key.event, second.key.event) for first, second in pairs} == {
         (event, None) for event in ("pause:50", "pause:100", "speed:2", "pause:50@subtask:9")
     }
     save_records(tmp_path, made)
@@ -440,7 +442,7 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     ]
     assert row[0] == "m, recipe recipe, checkpoint 1, seed 7, test"
     (points,) = event_curves(made).values()
-    assert [(p.turned, p.won, p.episodes) for p in points] == [(0, 6, 8), (64, 3, 8)]
+    assert [(at, p.won, p.episodes) for at, p in points.items()] == [(0, 6, 8), (64, 3, 8)]
     assert distinct_parts(["m, recipe a, seed 7", "m, recipe b, seed 7"]) == [
         "recipe a",
         "recipe b",
@@ -451,7 +453,7 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     )
     # A training without some of the event's episodes counts at no place with these.
     (points,) = event_curves(made[:-2]).values()
-    assert [(p.turned, p.episodes) for p in points] == [(0, 6), (64, 6)]
+    assert [(at, p.episodes) for at, p in points.items()] == [(0, 6), (64, 6)]
 
 
 @pytest.mark.slow

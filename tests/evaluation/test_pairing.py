@@ -22,7 +22,7 @@ from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import aggregate, repeated_episodes
-from mme_vla.evaluation.results.compare import common_episodes, compare
+from mme_vla.evaluation.results.compare import compare, pair_methods
 from mme_vla.evaluation.results.events import event_curves, event_table
 from mme_vla.evaluation.results.ood import amount_of, twin_table
 from mme_vla.evaluation.results.scopes import Protocol
@@ -152,7 +152,7 @@ def test_nothing_in_common_is_said_and_not_compared(
         main([*options, "--compare", "m", "n"])
     assert reason in " ".join(capsys.readouterr().err.split())
     first, second = aggregate(every, PROTOCOL).methods
-    assert common_episodes(first, second) == set()
+    assert pair_methods(first, second).keys == ()
 
 
 def test_pairs_without_digests_are_counted(
@@ -210,7 +210,7 @@ def test_events_are_matched_with_the_same_scenes() -> None:
     row = dict(zip(table.columns, table.rows[0], strict=True))
     assert (row["pairs"], row["lost"]) == ("2", "2") and "2 episodes not paired" in table.notes[0]
     (points,) = event_curves(every).values()
-    assert [point.episodes for point in points] == [2, 2]
+    assert [point.episodes for point in points.values()] == [2, 2]
 
 
 def test_twins_are_the_same_scenes() -> None:

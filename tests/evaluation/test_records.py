@@ -19,7 +19,7 @@ from mme_vla.evaluation.records import (
     EpisodeRecord,
     RecordLog,
     Seconds,
-    by_run,
+    check_settings,
     display_name,
     merge,
 )
@@ -185,14 +185,14 @@ def test_one_episode_in_two_environments_is_refused() -> None:
 
 def test_a_run_of_two_step_limits_is_refused() -> None:
     with pytest.raises(UserError, match="mixes max_steps 300 and 1300"):
-        by_run([record(), record(episode=1, max_steps=300)])
+        check_settings([record(), record(episode=1, max_steps=300)])
 
 
 def test_a_task_of_one_name_in_two_environments_is_refused() -> None:
     of_one = [record(task="reach", env=env, episode=e) for e, env in enumerate(("mine", None))]
-    assert len(by_run(of_one)) == 1  # not every record names its environment
+    check_settings(of_one)  # not every record names its environment
     with pytest.raises(UserError, match="mixes env mine and yours"):
-        by_run([*of_one, record(task="reach", env="yours", episode=2)])
+        check_settings([*of_one, record(task="reach", env="yours", episode=2)])
 
 
 def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:

@@ -267,16 +267,14 @@ def test_own_tasks_form_a_group_beside_the_benchmark() -> None:
         records("a", {"TwoButtons": [1, 1], "Stay": [0, 1]}),
     )
     (alone,) = aggregate(custom, Protocol(tasks_of(custom), 2, samples=100)).methods
-    assert (alone.average.mean, alone.figures["suite"]["Own tasks"].mean, alone.complete) == (
-        75.0,
-        75.0,
-        True,
-    )
+    assert (alone.average.mean, alone.figures["suite"]["Own tasks"].mean) == (75.0, 75.0)
+    assert all(run.complete for run in alone.runs)
     tasks = ("BinFill", "TwoButtons", "Stay")
     both = aggregate([*benchmark, *custom], Protocol(tasks, 2, samples=100))
     (method,) = both.methods
     assert (method.average.mean, method.figures["suite"]["Own tasks"].mean) == (50.0, 75.0)
-    assert method.figures["task"]["TwoButtons"].mean == 100.0 and method.complete
+    assert method.figures["task"]["TwoButtons"].mean == 100.0
+    assert all(run.complete for run in method.runs)
     assert both.notes == []
     assert tasks_of([*benchmark, *custom]) == (*PAPER_ORDER, "Stay", "TwoButtons")
 
@@ -567,7 +565,7 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
     main(options)
     printed = capsys.readouterr().out
     assert "50.0 (2 of 4)" in printed
-    assert "pi05 and ttt_modul have no episode in common, and are not compared." in printed
+    assert "pi05 and ttt_modul have no episode in common: there is nothing to pair." in printed
     with pytest.raises(SystemExit) as ended:
         main([*options, "--compare", "pi05", "ttt_modul"])
     assert ended.value.code == 2
@@ -583,7 +581,7 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
         ),
         ({"memory": {"budget": 64}, "card": {"recipe": {}}}, "memory without a name, 64 tokens"),
         (
-            {"memory": "ttt", "integration": "expert", "card": "manually"},
+            {"memory": {"name": "ttt"}, "integration": {"name": "expert"}},
             "memory ttt, integration expert",
         ),
         ({"card": {"recipe": "as released"}}, "training: as released"),

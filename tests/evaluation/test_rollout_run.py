@@ -159,13 +159,15 @@ def test_shards_side_by_side_make_the_full_run(
     assert both == outcomes(tmp_path / "alone")
 
 
-def test_a_shard_comes_from_the_word_or_from_torchrun() -> None:
-    assert choose_shard(None, {}) == Shard(0, 1) and Shard(0, 1).file == "episodes.jsonl"
-    assert choose_shard(None, {"RANK": "2", "WORLD_SIZE": "4"}) == Shard(2, 4)
-    assert choose_shard("1/4", {"RANK": "2", "WORLD_SIZE": "4"}) == Shard(1, 4)
+def test_a_shard_comes_from_the_word_or_from_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RANK", raising=False)
+    assert choose_shard(None) == Shard(0, 1) and Shard(0, 1).file == "episodes.jsonl"
     for wrong in ("4/4", "1", "a/b", "1/0"):
         with pytest.raises(UserError, match="counted from 0"):
-            choose_shard(wrong, {})
+            choose_shard(wrong)
+    monkeypatch.setenv("RANK", "2")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    assert choose_shard(None) == Shard(2, 4) and choose_shard("1/4") == Shard(1, 4)
 
 
 def test_environments_that_cannot_begin_stop_the_run() -> None:

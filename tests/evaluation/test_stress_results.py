@@ -22,9 +22,9 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
     stress_records += [*records("stress:count=2", [1, 1], "other"), *records("twin", [1, 1])]
     curves = stress_curves(stress_records)
     mine = next(points for (run, *_), points in curves.items() if run.startswith("m,"))
-    assert [(p.turned, p.won, p.episodes) for p in mine] == [(0, 2, 2), (2, 1, 2), (5, 0, 2)]
+    assert [(at, p.won, p.episodes) for at, p in mine.items()] == [(0, 2, 2), (2, 1, 2), (5, 0, 2)]
     other = next(points for (run, *_), points in curves.items() if run.startswith("other"))
-    assert [(p.turned, p.rate) for p in other] == [(2, 100.0)]
+    assert [(at, p.rate) for at, p in other.items()] == [(2, 100.0)]
     assert mine[0].interval.low < 100 == mine[0].interval.high and len(stress_figures(curves)) == 1
 
 
@@ -35,7 +35,9 @@ def test_two_configurations_of_one_name_have_a_curve_each() -> None:
             for record in records(split, [won, won]):
                 stress_records.append(replace(record, composition=composition))
     curves = stress_curves(stress_records)
-    assert [[(p.turned, p.won, p.episodes) for p in points] for points in curves.values()] == [
+    assert [
+        [(at, p.won, p.episodes) for at, p in points.items()] for points in curves.values()
+    ] == [
         [(0, 2, 2), (2, 2, 2)],
         [(0, 0, 2), (2, 0, 2)],
     ]

@@ -28,7 +28,7 @@ from mme_vla.testing.small import SMALL_VISION, small_policy
 from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
 from mme_vla.training.optim import EMA
 from mme_vla.training.settings import KeepRule
-from mme_vla.utils import SUMS, check_sums, checked_file, write_sums
+from mme_vla.utils import SUMS, Sums, check_sums, checked_file, write_sums
 from mme_vla.weights import load_weights, start_from
 from mme_vla.weights.source import Source
 from mme_vla.weights.statistics import read_stats
@@ -164,7 +164,7 @@ def test_the_line_that_the_message_names_lets_a_file_in(tmp_path: Path) -> None:
             "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad  ./stats.json\n"
         )
     assert checked_file(tmp_path, "stats.json") == tmp_path / "stats.json"
-    assert check_sums(tmp_path)
+    check_sums(tmp_path, [*Sums(tmp_path).table])
 
 
 def test_the_weights_that_are_read_are_listed_relative_to_the_folder(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_what_the_environment_does_not_name_is_not_judged() -> None:
     score = SubgoalScore()
     score.add("press the button", None)
     assert (score.chunks, score.judged, score.accuracy, score.mean_distance) == (1, 0, None, None)
-    assert score.show() == ("–", "–")
+    assert score.show() == ["–", "–"]
     score.add(None, "press the button")
     assert score.accuracy == 0
 

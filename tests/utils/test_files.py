@@ -18,6 +18,7 @@ from mme_vla.errors import UserError, require
 from mme_vla.utils import (
     SUMS,
     FolderLock,
+    Sums,
     check_sums,
     inside,
     io,
@@ -162,20 +163,22 @@ def test_names_of_folders_hold_no_paths() -> None:
 def test_a_flipped_bit_is_detected_by_its_sum(tmp_path: Path) -> None:
     (tmp_path / "weights").write_bytes(b"\0" * 64)
     (tmp_path / "config").write_text("{}")
-    assert not check_sums(tmp_path)
+    assert not Sums(tmp_path).there
     write_sums(tmp_path)
     (tmp_path / "note").write_text("added later")
-    assert check_sums(tmp_path)
+    files = ["config", "weights"]
+    assert sorted(Sums(tmp_path).table) == files
+    check_sums(tmp_path, files)
     (tmp_path / "weights").write_bytes(b"\0" * 63 + b"\1")
-    assert check_sums(tmp_path, ["config"])
+    check_sums(tmp_path, ["config"])
     with pytest.raises(UserError, match="weights is damaged"):
-        check_sums(tmp_path)
+        check_sums(tmp_path, files)
     (tmp_path / "weights").unlink()
     with pytest.raises(UserError, match="missing"):
-        check_sums(tmp_path)
+        check_sums(tmp_path, files)
     (tmp_path / SUMS).write_text("nonsense\n")
     with pytest.raises(UserError, match="line 1"):
-        check_sums(tmp_path)
+        check_sums(tmp_path, files)
 
 
 def test_the_sums_are_those_of_sha256sum(tmp_path: Path) -> None:

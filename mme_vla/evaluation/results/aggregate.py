@@ -21,7 +21,7 @@ from mme_vla.evaluation.records import (
     EpisodeKey,
     EpisodeRecord,
     RunKey,
-    by_run,
+    check_settings,
     count_outcomes,
     merge,
 )
@@ -40,7 +40,7 @@ from mme_vla.evaluation.results.scopes import (
     tasks_of,
 )
 from mme_vla.evaluation.results.statistics import Interval, bootstrap, mean_interval, mean_std
-from mme_vla.policy.training_identity import without_seed
+from mme_vla.policy.training_identity import TrainingIdentity, without_seed
 
 
 def record_table(records: Sequence[EpisodeRecord]) -> pd.DataFrame:
@@ -139,23 +139,17 @@ class Method:
     """All runs of one model by one recipe, with the figures of every scope in
     `figures[kind][name]`.
 
+    label: the key's, unless that is of several methods.
+    key: what its runs share (`_method_key`).
     table: its part of `record_table`.
-    recipe, data: digests of what its trainings share; None where records do not name them.
-    event: what happened in the rollouts; None for the plain ones.
     repeated, flipped: see `Comparison`.
     """
 
     label: str
-    model: str
-    subgoal: str | None
-    memory_budget: int | None
+    key: RunKey
     runs: list[Run]
     table: pd.DataFrame
     paper: PaperMethod | None
-    composition: str | None = None
-    recipe: str | None = None
-    data: str | None = None
-    event: str | None = None
     figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
     repeated: int = 0
     flipped: int = 0
@@ -168,10 +162,6 @@ class Method:
     def trainings(self) -> list[list[Run]]:
         """The runs of each training; all in one group where records do not name their training."""
         return by_training(self.runs)
-
-    @property
-    def complete(self) -> bool:
-        return all(run.complete for run in self.runs)
 
     @cached_property
     def success(self) -> pd.DataFrame:
@@ -230,7 +220,7 @@ class Results:
         for method in self.methods:
             if method.label == label:
                 return method
-        of_model = [method for method in self.methods if method.model == label]
+        of_model = [method for method in self.methods if method.key.model == label]
         if len(of_model) == 1:
             return of_model[0]
         raise UserError(
@@ -289,11 +279,12 @@ def aggregate(
         f" {'; '.join(listed)}.",
     )
     _check_environments(included)
-    by_run(included)  # refuses runs of mixed settings
+    check_settings(included)
     table = record_table(included)
     table["method"] = table["run"].map(_method_key)
-    methods = [_method(members, protocol) for _, members in table.groupby("method", sort=False)]
-    methods.sort(key=lambda method: is_standing(method.model))  # last in every table
+    by_method = table.groupby("method", sort=False)
+    methods = [_method(key, members, protocol) for key, members in by_method]
+    methods.sort(key=lambda method: is_standing(method.key.model))  # last in every table
     repeats = repeated_episodes(records)
     for method in methods:
         for run in method.runs:
@@ -344,14 +335,22 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
         if count == 1:
             continue
         same = [method for method in methods if method.label == label]
-        names = []
-        for name in kinds:
-            if len({getattr(method, name) for method in same}) > 1:
-                names.append(name)
-        lacking = False
+        facts: list[dict[str, str | None]] = []
         for method in same:
+            training = method.key.training or TrainingIdentity()
+            facts.append(
+                {
+                    "model": method.key.model,
+                    "composition": method.key.composition,
+                    "recipe": training.recipe,
+                    "data": training.data,
+                }
+            )
+        names = [name for name in kinds if len({fact[name] for fact in facts}) > 1]
+        lacking = False
+        for method, fact in zip(same, facts, strict=True):
             for name in names:
-                value = getattr(method, name)
+                value = fact[name]
                 lacking = lacking or value is None
                 if name != "model":  # a digest
                     value = (value or "unrecorded")[:10]
@@ -371,12 +370,12 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
     return notes
 
 
-def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
+def _method(key: RunKey, table: pd.DataFrame, protocol: Protocol) -> Method:
     """One method from its part of the table, with its figures."""
     runs = []
-    for key, members in table.groupby("run", sort=False):
+    for run, members in table.groupby("run", sort=False):
         records = {record.key: record for record in members["record"]}
-        runs.append(Run(key, records, protocol))
+        runs.append(Run(run, records, protocol))
     runs.sort(
         key=lambda run: (
             _training_seed(run) or 0,
@@ -384,26 +383,13 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
             run.key.model_seed,
         )
     )
-    key = runs[0].key
     known = None
     other_scenes = any(is_other(run.key.split) for run in runs)
     of_benchmark = any(record.task in TASK_FACTS for record in table["record"])
     is_standard = key.event is None and key.memory_budget in (None, DEFAULT_BUDGET)
     if is_standard and of_benchmark and not other_scenes:
         known = paper.paper_method(key.model, key.subgoal)
-    method = Method(
-        key.label,
-        key.model,
-        key.subgoal,
-        key.memory_budget,
-        runs,
-        table,
-        known,
-        composition=key.composition,
-        recipe=None if key.training is None else key.training.recipe,
-        data=None if key.training is None else key.training.data,
-        event=key.event,
-    )
+    method = Method(key.label, key, runs, table, known)
     # Every episode that a run is to have, in order; NaN where it lacks it.
     keys = [(task, number) for task in protocol.tasks for number in protocol.numbers_of(task)]
     success = method.success.reindex(pd.MultiIndex.from_tuples(keys, names=["task", "episode"]))
@@ -538,4 +524,4 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
         notes.append(
             f"Left out: {counted(outside, 'record')} of other tasks, or of other episodes."
         )
-    return notes + missing_baselines(method.model for method in methods)
+    return notes + missing_baselines(method.key.model for method in methods)

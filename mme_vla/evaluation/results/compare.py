@@ -9,7 +9,7 @@ from mme_vla.errors import counted, require
 from mme_vla.evaluation.pairing import Pairing, pair
 from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.evaluation.results.aggregate import Method, by_task
-from mme_vla.evaluation.results.scopes import Protocol, scopes
+from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import (
     Interval,
     bootstrap,
@@ -34,7 +34,6 @@ class Comparison:
     significant: `corrected` is below 1 − confidence.
     smallest_p: the smallest that p can be with so many episodes.
     testable: whether that, corrected, is significant.
-    suites: difference and interval of each suite.
     repeated, flipped: episodes that were run twice with the same weights and seed, and those of
         them that then ended otherwise; of both methods.
     paired: whether episodes are paired; if not, wins and losses are 0, and interval and p are of
@@ -56,7 +55,6 @@ class Comparison:
     p: float
     corrected: float
     significant: bool
-    suites: dict[str, tuple[float, Interval]]
     smallest_p: float = 0.0
     testable: bool = True
     repeated: int = 0
@@ -141,11 +139,6 @@ def pair_methods(first: Method, second: Method) -> Pairing[EpisodeKey]:
     return pair([run.episodes for run in (*first.runs, *second.runs)])
 
 
-def common_episodes(first: Method, second: Method) -> set[EpisodeKey]:
-    """The episodes that `compare` pairs."""
-    return set(pair_methods(first, second).keys)
-
-
 def why_unpaired(first: Method, second: Method) -> str:
     """Why no episode of two methods can be paired, in a sentence or two."""
     what = f"{first.label} and {second.label}"
@@ -172,29 +165,19 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     gaps = (first_rates.mean(axis=1) - second_rates.mean(axis=1)).round(9)
     first_rate = _score(first_rates)
     second_rate = _score(second_rates)
-    trained = len(first_rates.columns) > 1 or len(second_rates.columns) > 1
-
-    def interval(tasks: Sequence[str]) -> Interval:
-        of_tasks = paired_interval(by_task(gaps.loc[tasks]), protocol.confidence)
-        if trained:
-            gains = by_task(first_rates.loc[tasks])
-            losses = by_task(-second_rates.loc[tasks])
-            sides = {task: [gains[task], losses[task]] for task in gains}
-            sampled = bootstrap(sides, protocol.confidence, protocol.samples, protocol.seed)
-            of_tasks = of_tasks.widen(sampled)
-        return of_tasks.percent
-
-    suites = {}
-    for scope in scopes(protocol):
-        inside = [task for task in scope.tasks if task in tasks]
-        if scope.kind == "suite" and inside:
-            difference = 100 * float(gaps.loc[inside].groupby(level="task").mean().mean())
-            suites[scope.name] = (difference, interval(inside))
+    interval = paired_interval(by_task(gaps), protocol.confidence)
+    if len(first_rates.columns) > 1 or len(second_rates.columns) > 1:
+        first_values = by_task(first_rates)
+        second_values = by_task(-second_rates)
+        sides = {task: [first_values[task], second_values[task]] for task in first_values}
+        sampled = bootstrap(sides, protocol.confidence, protocol.samples, protocol.seed)
+        interval = interval.widen(sampled)
     wins = int((gaps > 0).sum())
     losses = int((gaps < 0).sum())
     p = sign_test(wins, losses)
     smallest_p = sign_test(len(gaps), 0)
-    comparison = Comparison(
+    what = f"{first.label} − {second.label}"
+    return Comparison(
         first.label,
         second.label,
         len(gaps),
@@ -202,22 +185,21 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
         first_rate,
         second_rate,
         first_rate - second_rate,
-        interval(tasks),
+        interval.percent,
         wins,
         losses,
         p,
         p,
         p < 1 - protocol.confidence,
-        suites,
         smallest_p,
         smallest_p < 1 - protocol.confidence,
         first.repeated + second.repeated,
         first.flipped + second.flipped,
+        notes=tuple(pairing.notes(what)),
+        gaps=tuple(pairing.gaps(what)),
         first_solved=float(first_rates.mean(axis=1).sum()),
         second_solved=float(second_rates.mean(axis=1).sum()),
     )
-    what = f"{comparison.first} − {comparison.second}"
-    return replace(comparison, notes=tuple(pairing.notes(what)), gaps=tuple(pairing.gaps(what)))
 
 
 def _score(rates: pd.DataFrame) -> float:

@@ -19,7 +19,7 @@ from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Results, record_table
 from mme_vla.evaluation.results.statistics import Interval, wilson
-from mme_vla.evaluation.results.tables import Table, task_tables
+from mme_vla.evaluation.results.tables import Table, span, task_tables
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils.style import COLOURS, LINE, figure, svg
 
@@ -40,18 +40,6 @@ class Share:
     def __str__(self) -> str:
         return f"{self.won}/{self.episodes}"
 
-    @property
-    def span(self) -> str:
-        """The interval as text."""
-        return f"[{self.interval.low:.1f}, {self.interval.high:.1f}]"
-
-
-@dataclass(frozen=True)
-class Point(Share):
-    """Success of a model on a task at one place of a dial."""
-
-    turned: float
-
 
 def count_successes(table: pd.DataFrame, confidence: float) -> Share:
     """Count the successes of a part of `record_table` that has one row at least."""
@@ -61,7 +49,8 @@ def count_successes(table: pd.DataFrame, confidence: float) -> Share:
     return Share(won, len(table), interval.percent)
 
 
-Curves = dict[tuple[str, str, str], list[Point]]  # (model, task, dial) → points, ascending
+Curves = dict[tuple[str, str, str], dict[float, Share]]
+"""(run, task, dial) → how far it is turned, ascending → success there."""
 
 
 class Place(NamedTuple):
@@ -152,14 +141,13 @@ def curves_of(
             common = set(pair(sides).keys)
         if not common:
             continue
-        curves[run, task, dial] = []
+        curves[run, task, dial] = {}
         for turned, side in sorted(zip(points, sides, strict=True), key=itemgetter(0)):
             counted: list[EpisodeRecord] = []
             for key in common:
                 counted += side[key]
             share = count_successes(record_table(counted), confidence)
-            point = Point(share.won, share.episodes, share.interval, turned)
-            curves[run, task, dial].append(point)
+            curves[run, task, dial][turned] = share
     return curves
 
 
@@ -167,35 +155,44 @@ def stress_table(curves: Curves, title: str = "Success over the dials") -> Table
     """Every point, a row each."""
     rows = []
     for (run, task, dial), points in sorted(curves.items()):
-        for p in points:
-            rows.append(
-                [run, task, dial, f"{p.turned:g}", str(p.episodes), f"{p.rate:.1f}", p.span]
-            )
+        for turned, share in points.items():
+            cells = [f"{turned:g}", str(share.episodes), f"{share.rate:.1f}", span(share.interval)]
+            rows.append([run, task, dial, *cells])
     return Table(title, ["run", "task", "dial", "at", "episodes", "success (%)", "interval"], rows)
 
 
-def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> dict[str, str]:
-    """For each task and dial a curve of every run, as SVG."""
-    groups: dict[tuple[str, str], dict[str, list[tuple[float, float, Interval]]]] = {}
+def stress_figures(
+    curves: Curves,
+    unit: str = "more than in the benchmark",
+    training: Mapping[str, tuple[float, float]] | None = None,
+) -> dict[str, str]:
+    """For each task and dial a curve of every run, as SVG.
+
+    unit: of the dial; empty where the dial's name says it.
+    training: task → the range of its training episodes, which is shaded.
+    """
+    groups: dict[tuple[str, str], dict[str, Mapping[float, Share]]] = {}
     for _, task, dial in sorted(curves):
         groups[task, dial] = {}
     # Runs keep the order of the records, and with it their colours.
     for (run, task, dial), points in curves.items():
-        groups[task, dial][run] = [(point.turned, point.rate, point.interval) for point in points]
+        groups[task, dial][run] = points
     figures = {}
     for (task, dial), runs in groups.items():
-        figures[f"{task}, {dial}"] = curve_figure(runs, f"{dial}: {unit}")
+        label = f"{dial}: {unit}" if unit else dial
+        shaded = None if training is None else training[task]
+        figures[f"{task}, {dial}"] = curve_figure(runs, label, shaded)
     return figures
 
 
 def curve_figure(
-    runs: Mapping[str, Sequence[tuple[float, float, Interval]]],
+    runs: Mapping[str, Mapping[float, Share]],
     label: str,
     training: tuple[float, float] | None = None,
 ) -> str:
     """Success over an amount, a curve of every run, as SVG.
 
-    runs: name → amount, success in percent and its interval.
+    runs: name → amount → success.
     label: of the amount.
     training: its shaded range.
     """
@@ -207,10 +204,10 @@ def curve_figure(
         if training is not None:
             axes.axvspan(*training, color=LINE, label="training range")
         for i, (name, points) in enumerate(zip(labels, runs.values(), strict=True)):
-            amounts, rates, intervals = map(np.array, zip(*points, strict=True))
-            low, high = intervals.T
+            rates = np.array([share.rate for share in points.values()])
+            low, high = np.array([share.interval for share in points.values()]).T
             axes.errorbar(
-                amounts,
+                list(points),
                 rates,
                 np.maximum([rates - low, high - rates], 0),
                 fmt="-o",

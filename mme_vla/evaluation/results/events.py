@@ -28,19 +28,11 @@ NO_EVENTS = "None of these records is of an event: evaluate with event=pause:100
 
 def matched_methods(results: Results) -> list[tuple[Method, Method]]:
     """Every method with an event and the same one without, where there is one."""
-
-    def identity(method: Method) -> tuple[object, ...]:
-        names = ("model", "subgoal", "memory_budget", "composition", "recipe", "data")
-        return tuple(getattr(method, name) for name in names)
-
-    baselines: dict[tuple[object, ...], Method] = {}
-    for method in results.methods:
-        if method.event is None:
-            baselines[identity(method)] = method
+    methods = {method.key: method for method in results.methods}
     matched = []
     for method in results.methods:
-        baseline = baselines.get(identity(method))
-        if method.event is not None and baseline is not None:
+        baseline = methods.get(method.key._replace(event=None))
+        if method.key.event is not None and baseline is not None:
             matched.append((method, baseline))
     return matched
 

@@ -21,11 +21,10 @@ from mme_vla.errors import SceneError
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import record_table, repeated_episodes
-from mme_vla.evaluation.results.curves import Share, count_successes, curve_figure, run_names
+from mme_vla.evaluation.results.curves import Curves, count_successes, run_names, stress_figures
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
-from mme_vla.evaluation.results.statistics import Interval
-from mme_vla.evaluation.results.tables import Table
+from mme_vla.evaluation.results.tables import Table, span
 
 SOURCE = "development records of the authors, one run each, 1,600 steps"
 AMOUNTS: dict[str, tuple[str, str, tuple[int, int]]] = {
@@ -81,7 +80,7 @@ def tier_tables(
                 cell = part[part["difficulty"] == tier]
                 row.append("–" if cell.empty else str(count_successes(cell, confidence)))
             share = count_successes(part, confidence)
-            row += [str(share), f"{share.rate:.1f}", share.span]
+            row += [str(share), f"{share.rate:.1f}", span(share.interval)]
             for line in published:
                 n_episodes = int(line["episodes"])
                 if task == "all":
@@ -106,7 +105,7 @@ def hard_table(
     rows = []
     for run, members in record_table(merged).groupby("run", sort=False):
         share = count_successes(members, confidence)
-        rows.append([str(run), str(share), f"{share.rate:.1f}", share.span])
+        rows.append([str(run), str(share), f"{share.rate:.1f}", span(share.interval)])
     n_runs = len(rows)
     for row in paper_table("hard"):
         won = [int(n) for n in row["won"].split()]
@@ -167,8 +166,8 @@ def twin_table(
             [
                 str(run),
                 str(len(gaps)),
-                f"{base_share.rate:.1f} {base_share.span}",
-                f"{visible_share.rate:.1f} {visible_share.span}",
+                f"{base_share.rate:.1f} {span(base_share.interval)}",
+                f"{visible_share.rate:.1f} {span(visible_share.interval)}",
                 f"{visible_share.rate - base_share.rate:+.1f}",
                 f"{100 - visible_share.rate:.1f}",
                 f"{(gaps > 0).sum()} : {(gaps < 0).sum()}",
@@ -224,15 +223,11 @@ def amount_of(task: str, split: str, key: EpisodeKey, scene: str | None = None) 
     return int(amount)
 
 
-Extrapolation = dict[tuple[str, str], dict[int, Share]]
-"""(model, task) → amount → success; all splits together."""
-
-
 def extrapolation(
     records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
-) -> Extrapolation:
+) -> Curves:
     """Success against the amount of what grows, over all splits of a model: training, test, stress
-    and OOD.
+    and OOD. The dial of a curve is what grows.
 
     Twins, and scenes that cannot be built or are other ones here, are left out.
     """
@@ -253,24 +248,24 @@ def extrapolation(
     names = run_names(runs)
     table["run"] = [names[run] for run in runs]
     table["amount"] = amounts
-    curves: Extrapolation = {}
+    curves: Curves = {}
     for (run, task, amount), members in table.groupby(["run", "task", "amount"], sort=False):
-        curves.setdefault((run, task), {})[amount] = count_successes(members, confidence)
+        kind, _, _ = AMOUNTS[task]
+        curves.setdefault((run, task, kind), {})[amount] = count_successes(members, confidence)
     return {curve: dict(sorted(points.items())) for curve, points in curves.items()}
 
 
-def extrapolation_table(curves: Extrapolation) -> Table | None:
+def extrapolation_table(curves: Curves) -> Table | None:
     """Every point, a row each; amounts beyond the training range are marked. None
     without a point.
     """
     rows = []
-    for (run, task), points in sorted(curves.items()):
-        kind, _, (least, most) = AMOUNTS[task]
+    for (run, task, kind), points in sorted(curves.items()):
+        _, _, (least, most) = AMOUNTS[task]
         for amount, share in points.items():
             trained = "trained" if least <= amount <= most else "beyond"
-            rows.append(
-                [run, task, kind, str(amount), trained, str(share), f"{share.rate:.1f}", share.span]
-            )
+            cells = [str(share), f"{share.rate:.1f}", span(share.interval)]
+            rows.append([run, task, kind, f"{amount:g}", trained, *cells])
     columns = [
         "run",
         "task",
@@ -284,16 +279,7 @@ def extrapolation_table(curves: Extrapolation) -> Table | None:
     return Table("Extrapolation", columns, rows) if rows else None
 
 
-def extrapolation_figures(curves: Extrapolation) -> dict[str, str]:
+def extrapolation_figures(curves: Curves) -> dict[str, str]:
     """For each task the success of every run against the amount, the training range shaded; SVG."""
-    groups: dict[str, dict[str, list[tuple[float, float, Interval]]]] = {}
-    for _, task in sorted(curves):
-        groups[task] = {}
-    # Runs keep the order of the records, and with it their colours.
-    for (run, task), points in curves.items():
-        groups[task][run] = [(amount, p.rate, p.interval) for amount, p in points.items()]
-    figures = {}
-    for task, runs in groups.items():
-        kind, _, (least, most) = AMOUNTS[task]
-        figures[f"{task}, {kind}"] = curve_figure(runs, kind, (least - 0.5, most + 0.5))
-    return figures
+    training = {task: (least - 0.5, most + 0.5) for task, (_, _, (least, most)) in AMOUNTS.items()}
+    return stress_figures(curves, "", training)

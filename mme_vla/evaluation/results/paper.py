@@ -9,9 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.optimize import brentq
+from scipy.special import expit
 
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
-from mme_vla.evaluation.results.scopes import MAX_STEPS, PAPER_ORDER, PAPER_SEEDS, TASK_FACTS
+from mme_vla.evaluation.results.scopes import (
+    MAX_STEPS,
+    PAPER_ORDER,
+    PAPER_SEEDS,
+    TASK_FACTS,
+    TEST_EPISODES,
+)
 
 FOLDER = Path(__file__).resolve().parents[2] / "assets" / "paper"
 
@@ -104,12 +112,7 @@ _LEVELS = ("easy", "easy", "medium", "hard")
 _EASE = {"easy": 0.8, "medium": 0.0, "hard": -1.0}
 
 
-def demo_records(
-    methods: Sequence[tuple[str, str | None]],
-    checkpoints: Sequence[int] = CHECKPOINTS,
-    seeds: Sequence[int] = PAPER_SEEDS,
-    episodes: int = 50,
-) -> list[EpisodeRecord]:
+def demo_records(methods: Sequence[tuple[str, str | None]]) -> list[EpisodeRecord]:
     """Draw outcomes at random: right on average for the paper's per-task rates, and meaningless
     otherwise.
 
@@ -123,16 +126,16 @@ def demo_records(
         assert known is not None
         for task, result in per_task(known.name).items():
             number = PAPER_ORDER.index(task)
-            levels = [_LEVELS[e % 4] for e in range(episodes)]
-            ease = np.random.default_rng([number]).normal(scale=1.5, size=episodes)
+            levels = [_LEVELS[e % 4] for e in range(TEST_EPISODES)]
+            ease = np.random.default_rng([number]).normal(scale=1.5, size=TEST_EPISODES)
             ease += [_EASE[level] for level in levels]
             chances = _chances(ease, result.mean / 100)
-            for checkpoint in checkpoints:
-                for seed in seeds:
+            for checkpoint in CHECKPOINTS:
+                for seed in PAPER_SEEDS:
                     rng = np.random.default_rng(
                         [zlib.crc32(known.name.encode()), number, checkpoint, seed]
                     )
-                    for episode, won in enumerate(rng.random(episodes) < chances):
+                    for episode, won in enumerate(rng.random(TEST_EPISODES) < chances):
                         outcome = "timeout"
                         steps = MAX_STEPS
                         if won:
@@ -158,12 +161,6 @@ def demo_records(
 
 def _chances(ease: np.ndarray, rate: float) -> np.ndarray:
     """Each episode's chance: a logistic of its ease, moved until the mean is `rate`."""
-    low, high = -30.0, 30.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        chances = 1 / (1 + np.exp(-(ease + middle)))
-        if chances.mean() < rate:
-            low = middle
-        else:
-            high = middle
-    return chances
+    mean = min(max(rate, 1e-9), 1 - 1e-9)  # which a logistic can have
+    shift = brentq(lambda shift: expit(ease + shift).mean() - mean, -50, 50)
+    return expit(ease + shift)

@@ -161,7 +161,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
     placed: list[tuple[int, Method, float]] = []  # number, and the average
     for i, method in enumerate(results.methods):
         mean = method.average.mean
-        if mean is not None and method.model in flops and method.memory_budget is None:
+        if mean is not None and method.key.model in flops and method.key.memory_budget is None:
             placed.append((i, method, mean))
     if not placed:
         return ""
@@ -184,7 +184,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
                 )
         for i, method, mean in placed:
             axes.errorbar(
-                flops[method.model] / 1e12,
+                flops[method.key.model] / 1e12,
                 mean,
                 method.average.std or 0,
                 fmt="o",
@@ -218,7 +218,7 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
 
     points: as `budget_points` gives them.
     """
-    order = list(dict.fromkeys(method.model for method in results.methods))
+    order = list(dict.fromkeys(method.key.model for method in results.methods))
     with figure((5.6, 3.9)) as (canvas, (axes,)):
         table = paper.paper_table("memory_budget")
         budgets = [int(row["memory_tokens"]) for row in table]
@@ -266,8 +266,8 @@ def budget_points(methods: Sequence[Method], default: int) -> dict[str, list[tup
     points: dict[str, list[tuple[int, Figure]]] = {}
     for method in methods:
         if method.average.mean is not None:
-            points.setdefault(method.model, []).append(
-                (method.memory_budget or default, method.average)
+            points.setdefault(method.key.model, []).append(
+                (method.key.memory_budget or default, method.average)
             )
     sweeps = {}
     for model, model_points in points.items():

@@ -26,6 +26,7 @@ from mme_vla.evaluation.results.tables import (
 )
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import RUN_FILE, read_run
+from mme_vla.policy.sections import PolicySections
 from mme_vla.utils.pages import render
 
 
@@ -251,13 +252,12 @@ def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     if "served" in config:
         return {}
-    card = config.get("card")
-    card = card if isinstance(card, Mapping) else {}
+    sections = PolicySections.of(config)
     return {
-        "memory": _section(config.get("memory")),
-        "integration": _section(config.get("integration")),
-        "data": card.get("data"),
-        "recipe": card.get("recipe"),
+        "memory": dict(sections.memory) or None,
+        "integration": dict(sections.integration) or None,
+        "data": sections.card.get("data"),
+        "recipe": sections.card.get("recipe"),
     }
 
 
@@ -281,9 +281,9 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
                 settings = content["settings"]
                 notes = content.get("notes") or {}
                 is_same = (
-                    settings.get("model") == method.model
+                    settings.get("model") == method.key.model
                     and checkpoint_number(settings.get("checkpoint", "")) == checkpoint
-                    and method.composition in (notes.get("composition"), None)
+                    and method.key.composition in (notes.get("composition"), None)
                 )
                 if is_same and notes.get("policy"):
                     facts = notes["policy"]
@@ -302,13 +302,13 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
 def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     if facts is None:
         return [("policy", UNKNOWN), ("training", UNKNOWN)]
-    memory = _section(facts.get("memory"))
+    memory = facts.get("memory")
     policy = "no memory"
     if memory:
         policy = f"memory {memory.get('name', 'without a name')}"
         if memory.get("budget") is not None:
             policy += f", {_text(memory['budget'])} tokens"
-    integration = _section(facts.get("integration"))
+    integration = facts.get("integration")
     if integration:
         policy += f", integration {integration.get('name', 'without a name')}"
     recipe = facts.get("recipe")
@@ -322,13 +322,6 @@ def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
                 stated.append(f"{words} {_text(recipe[name])}")
         training = ", ".join(stated) or UNKNOWN
     return [("policy", policy), ("data", str(facts.get("data") or UNKNOWN)), ("training", training)]
-
-
-def _section(value: Any) -> dict[str, Any] | None:
-    """A part of the configuration; one that is a word alone is its name."""
-    if not value:
-        return None
-    return dict(value) if isinstance(value, Mapping) else {"name": str(value)}
 
 
 def _text(value: Any) -> str:

@@ -62,7 +62,6 @@ _TASKS = (
     _task("RouteStick", 3, "P", 0, True, 370),
 )
 TASK_FACTS: dict[str, Task] = {task.name: task for task in _TASKS}
-TASK_NAMES = tuple(TASK_FACTS)  # The tasks in the benchmark's order
 PAPER_ORDER = (
     "BinFill", "PickXtimes", "SwingXtimes", "StopCube",
     "VideoUnmask", "ButtonUnmask", "VideoUnmaskSwap", "ButtonUnmaskSwap",

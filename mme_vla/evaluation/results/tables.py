@@ -134,7 +134,7 @@ def overview(results: Results) -> Table:
 
 def _before_baselines(results: Results) -> set[int]:
     """The first row of a standing baseline, where other methods stand above it."""
-    standing = [is_standing(method.model) for method in results.methods]
+    standing = [is_standing(method.key.model) for method in results.methods]
     return {standing.index(True)} if len(set(standing)) == 2 else set()
 
 

@@ -6,7 +6,6 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from mme_vla.data.console import Bar
@@ -52,7 +51,7 @@ class RolloutProgress(Bar):
             text += f" · {errors} errors"
         return text
 
-    def announce(self, folder: Path, forecast: "Forecast | None") -> None:
+    def announce(self, folder: Path, forecast: str | None) -> None:
         """Say what the run's folder holds, and how long the rest takes."""
         if self.done:
             self.say(
@@ -60,7 +59,7 @@ class RolloutProgress(Bar):
                 " the others"
             )
         if forecast is not None:
-            self.say(str(forecast))
+            self.say(forecast)
 
     def episode(self, record: EpisodeRecord, again: bool = False) -> None:
         """One episode ended; `again` if it will be tried once more, and does not count yet."""
@@ -140,8 +139,8 @@ class Durations:
         """The jobs, those that took longest first; in their own order without records."""
         return sorted(jobs, key=lambda job: -sum(self.of(job)))
 
-    def forecast(self, jobs: Sequence[Job], workers: int, processes: int = 1) -> "Forecast | None":
-        """What running the jobs will take; None without records.
+    def forecast(self, jobs: Sequence[Job], workers: int, processes: int = 1) -> str | None:
+        """How long running the jobs will take, in a sentence; None without records.
 
         Environments run side by side while the policy acts: the slower of the two decides, and the
         longest episode is waited for in any case.
@@ -154,33 +153,12 @@ class Durations:
         each = [self.of(job) for job in jobs]
         environment, policy = (sum(column) for column in zip(*each, strict=True))
         seconds = max(environment / workers, policy, max(map(sum, each)) * processes) / processes
-        return Forecast(seconds, len(jobs), len(self.records), workers * processes)
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """How long the rest of a run takes.
-
-    seconds: from now to the end.
-    episodes: that are left.
-    records: it is made from.
-    at_once: environments.
-    """
-
-    seconds: float
-    episodes: int
-    records: int
-    at_once: int
-
-    def __str__(self) -> str:
-        hours = self.seconds / 3600
-        if hours >= 1:
-            time = f"{hours:.1f} h"
-        elif self.seconds >= 60:
-            time = f"{self.seconds / 60:.0f} min"
-        else:
-            time = "a minute at most"
+        time = "a minute at most"
+        if seconds >= 3600:
+            time = f"{seconds / 3600:.1f} h"
+        elif seconds >= 60:
+            time = f"{seconds / 60:.0f} min"
         return (
-            f"forecast: about {time} for {counted(self.episodes, 'episode')}, {self.at_once} at a"
-            f" time, if they take as long as the {self.records:,} before them did"
+            f"forecast: about {time} for {counted(len(jobs), 'episode')}, {workers * processes} at"
+            f" a time, if they take as long as the {len(self.records):,} before them did"
         )

@@ -82,14 +82,10 @@ class SubgoalScore:
         """
         return self.distance / self.points if self.points else None
 
-    def show(self) -> tuple[str, str]:
-        """Accuracy and distance with their units, for a terminal."""
-        accuracy = distance = "–"
-        if self.accuracy is not None:
-            accuracy = f"{self.accuracy:.1f} %"
-        if self.mean_distance is not None:
-            distance = f"{self.mean_distance:.1f} px"
-        return accuracy, distance
+    def show(self) -> list[str]:
+        """Accuracy and distance as cells of a table."""
+        values = (self.accuracy, self.mean_distance)
+        return ["–" if value is None else f"{value:.1f}" for value in values]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for a record."""
@@ -144,10 +140,7 @@ def subgoal_tables(results: Results) -> list[Table]:
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
     total = total_score(records) or SubgoalScore()
-    cells = [name, str(len(records)), str(total.judged)]
-    for value in (total.accuracy, total.mean_distance):
-        cells.append("–" if value is None else f"{value:.1f}")
-    cells.append(str(total.asked))
+    cells = [name, str(len(records)), str(total.judged), *total.show(), str(total.asked)]
     problems = [f"{count} {kind}" for kind, count in sorted(total.problems.items())]
     cells.append(", ".join(problems) or "0")
     return cells

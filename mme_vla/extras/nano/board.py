@@ -67,7 +67,7 @@ class Row:
         """A `policy` with memory, a `floor` or a `ceiling`, as one is that reads the simulator's
         subgoals.
         """
-        subgoal = self.method.subgoal
+        subgoal = self.method.key.subgoal
         if subgoal == "oracle":
             return "ceiling"
         if self.facts.trained and self.facts.budget is None and subgoal is None:
@@ -90,7 +90,7 @@ class Row:
         """The published method that the row is, at its default budget."""
         if self.budget:
             return None
-        known = paper.paper_method(self.name, self.method.subgoal)
+        known = paper.paper_method(self.name, self.method.key.subgoal)
         reported = [line["method"] for line in paper.paper_table("suites")]
         return known if known and known.name in reported else None
 

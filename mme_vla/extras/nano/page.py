@@ -16,8 +16,8 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import (
     Comparison,
-    common_episodes,
     compare_all,
+    pair_methods,
     why_unpaired,
 )
 from mme_vla.evaluation.results.scopes import Protocol
@@ -146,7 +146,7 @@ def compared(
     pairs = []
     for method in methods.values():
         pair = (baseline, method) if without is None else (method, baseline)
-        if common_episodes(*pair):
+        if pair_methods(*pair).keys:
             pairs.append(pair)
         else:
             results.notes.append(why_unpaired(*pair))

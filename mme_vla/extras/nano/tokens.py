@@ -18,7 +18,7 @@ from torch import Tensor
 import mme_vla.memory  # noqa: F401  (registers what ships)
 from mme_vla.errors import require
 from mme_vla.extras.nano.demonstrations import Demonstration
-from mme_vla.memory.history import FrameScores
+from mme_vla.memory.history import FrameScores, score_frames
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.sections import PolicySections
@@ -129,16 +129,9 @@ def _scores(memory: "Memory", images: Mapping[int, np.ndarray]) -> FrameScores:
     """The scores of these frames by the memory's scorer, as in an episode."""
     scorer = memory.make_scorer()
     assert scorer is not None
-    rows: dict[int, np.ndarray] = {}
-    for frame in scorer.frames_scored(max(images) + 1).tolist():
-        if frame not in images:
-            continue
-        values = scorer(frame, images[frame])
-        if values is not None:
-            rows[frame] = values
-    if not rows:
-        return FrameScores.empty(memory.storage.grid**2)
-    return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
+    needed = scorer.frames_scored(max(images) + 1).tolist()
+    scored = {frame: images[frame] for frame in needed if frame in images}
+    return score_frames(scorer, scored, memory.storage.grid**2)
 
 
 @dataclass(frozen=True)

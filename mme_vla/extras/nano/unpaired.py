@@ -50,7 +50,6 @@ def compare_unpaired(first: Method, second: Method, protocol: Protocol) -> Compa
         p,
         p,
         p < 1 - protocol.confidence,
-        {},
         smallest_p,
         smallest_p < 1 - protocol.confidence,
         first.repeated + second.repeated,

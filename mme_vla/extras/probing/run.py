@@ -19,7 +19,7 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import ARM, EpisodeRecord, RunKey, display_name
 from mme_vla.evaluation.results.aggregate import aggregate
-from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.compare import Comparison, compare_all, pair_methods
 from mme_vla.evaluation.results.events import idle_events
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import (
@@ -314,19 +314,21 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
         return []
     protocol = Protocol.of_records(records)
     methods = aggregate(records, protocol, split).methods
-    unprobed = [method for method in methods if method.model == model and method.event is None]
+    unprobed = [
+        method for method in methods if method.key.model == model and method.key.event is None
+    ]
     baseline = unprobed[0] if unprobed else None
     for method in methods:
         if method is baseline:
             method.label = UNPROBED.name
-        elif method.event is not None:
-            method.label = f"event {method.event}"
+        elif method.key.event is not None:
+            method.label = f"event {method.key.event}"
         else:
-            method.label = method.model.removeprefix(f"{model}{ARM}")
+            method.label = method.key.model.removeprefix(f"{model}{ARM}")
     if baseline is None:
         return []
     pairs = []
     for method in methods:
-        if method is not baseline and common_episodes(method, baseline):
+        if method is not baseline and pair_methods(method, baseline).keys:
             pairs.append((method, baseline))
     return compare_all(pairs, protocol)

@@ -20,10 +20,10 @@ from mme_vla.extras.probing.evidence import EvidenceEpisode
 from mme_vla.memory.base import MemoryModule, stack_history
 from mme_vla.memory.history import (
     CachedHistory,
-    FrameScores,
     History,
     TokenlessHistory,
     TokensReadError,
+    score_frames,
 )
 from mme_vla.processing.normalise import normalize
 
@@ -330,15 +330,8 @@ def memory_selection(
         policy: makes the tokens; None where the memory reads none to choose.
     """
     # The scores of frames, for memories that choose by them.
-    scorer = memory.make_scorer()
-    values = {}
-    for frame in sorted(episode.images):
-        row = None if scorer is None else scorer(frame, episode.images[frame])
-        if row is not None:
-            values[frame] = row
-    scores = None
-    if values:
-        scores = FrameScores(np.array(list(values)), np.stack(list(values.values())))
+    patches = memory.storage.grid**2
+    scores = score_frames(memory.make_scorer(), episode.images, patches)
 
     # Their tokens, for memories that read them.
     stored = memory.storage.stored_frames(episode.length)

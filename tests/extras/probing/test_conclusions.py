@@ -52,7 +52,6 @@ def compared(arm: str, wins: int, losses: int, episodes: int, arms: int = 1) -> 
         p,
         p,
         p < 0.05,
-        {},
         smallest,
         smallest < 0.05,
         first_solved=solved + wins - losses,
