@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import check_choice, check_sizes, require
-from mme_vla.memory.extensions.attending import FrameMemory, by_frame
+from mme_vla.memory.base import FrameMemory
+from mme_vla.memory.extensions.attending import by_frame
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import check_every, default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
