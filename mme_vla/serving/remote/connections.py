@@ -17,7 +17,6 @@ import numpy as np
 from mme_vla.errors import UserError, brief
 from mme_vla.serving.client import (
     LARGEST_REPLY,
-    Client,
     closed,
     decoded_map,
     key_header,
@@ -281,10 +280,3 @@ def _decoded(data: Any) -> dict[str, Any]:
     if not isinstance(message, dict):
         raise UserError(f"The server's reply is malformed: {brief(message)} is no map.")
     return message
-
-
-def open_websocket(
-    url: str, api_key: str | None, timeout: float, open_timeout: float
-) -> Connection:
-    """Connect to a server that sends its metadata first."""
-    return Client(url, api_key=api_key, timeout=timeout, open_timeout=open_timeout)
