@@ -28,7 +28,7 @@ except ImportError as error:  # the extra is missing: say which
 
 def pack(message: Any) -> bytes:
     try:
-        packed = msgpack.packb(message, default=_encode)
+        packed = msgpack.packb(message, default=encode)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"This message cannot be encoded: {error}") from error
     assert isinstance(packed, bytes)
@@ -83,7 +83,8 @@ def unpack(
         ) from error
 
 
-def _encode(value: Any) -> dict[bytes, Any]:
+def encode(value: Any) -> dict[bytes, Any]:
+    """An array or a NumPy scalar as a map; raises TypeError or ValueError for all else."""
     if not isinstance(value, np.ndarray | np.generic):
         raise TypeError(
             f"{type(value).__name__} has no form in msgpack; use numbers, text, lists, dicts and"

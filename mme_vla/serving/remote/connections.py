@@ -22,7 +22,7 @@ from mme_vla.serving.client import (
     key_header,
     open_socket,
 )
-from mme_vla.serving.codec import msgpack, pack, read_array, unpack
+from mme_vla.serving.codec import encode, msgpack, pack, read_array, unpack
 
 PAUSE_S = 0.5  # between two attempts to open a connection
 STARTUP_S = 2.0  # in which a server that sends its metadata first has sent them
@@ -251,17 +251,10 @@ class HarnessConnection:
 
 
 def _encode(value: Any) -> Any:
-    """An array as the harness has it: the keys are texts, not bytes."""
-    if isinstance(value, np.ndarray):
-        return {
-            "__ndarray__": True,
-            "data": value.tobytes(),
-            "dtype": value.dtype.str,
-            "shape": list(value.shape),
-        }
+    """An array as the harness has it: the keys are texts, not bytes, and scalars are numbers."""
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"{type(value).__name__} has no form in msgpack")
+    return {key.decode(): entry for key, entry in encode(value).items()}
 
 
 def _decoded(data: Any) -> dict[str, Any]:
