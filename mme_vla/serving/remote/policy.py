@@ -83,9 +83,8 @@ class RemoteEpisode(Episode):
         self._views: list[Mapping[str, Any]] = []
         self._states: list[np.ndarray] = []
         self._n_video = 0
-        self._leading: list[np.ndarray] | None = []
+        self._leading: list[np.ndarray] = []
         self._current: Mapping[str, Any] = {}
-        self._state = np.zeros(0, np.float32)
         self.connection: Connection | None = None
         self._failure: Failure | None = None
 
@@ -114,9 +113,8 @@ class RemoteEpisode(Episode):
         self._states.append(np.asarray(states, np.float32))
         if count:
             self._current = {name: view[-1] for name, view in views.items()}
-            self._state = self._states[-1][-1]
         self._n_video += int(np.broadcast_to(np.asarray(is_demo, bool), (count,)).sum())
-        if actions is not None and self._leading is not None:
+        if actions is not None:
             self._leading.append(np.asarray(actions, np.float32))
 
     def take_frames(self) -> NewFrames:
@@ -137,7 +135,7 @@ class RemoteEpisode(Episode):
             views=views,
             states=np.concatenate(self._states),
             current=self._current,
-            state=self._state,
+            state=self.state.numpy(),
             n_video=self._n_video,
             executed=executed,
             first=self.connection is None,

@@ -15,7 +15,7 @@ MOST_TOKENS = 2**40
 
 @dataclass(frozen=True)
 class Reply:
-    """A usable reply and the tokens it took; thoughts count as output."""
+    """A reply of a model and the tokens it took; thoughts count as output."""
 
     text: str
     input_tokens: int
