@@ -9,7 +9,7 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from mme_vla.errors import UserError, brief
 from mme_vla.serving.client import (
     LARGEST_REPLY,
+    Client,
     closed,
     decoded_map,
     key_header,
@@ -26,19 +27,6 @@ from mme_vla.serving.codec import encode, msgpack, pack, read_array, unpack
 
 PAUSE_S = 0.5  # between two attempts to open a connection
 STARTUP_S = 2.0  # in which a server that sends its metadata first has sent them
-
-
-class Connection(Protocol):
-    """One connection to a server, with one episode at a time.
-
-    Requests raise `UserError` where the server refuses one or its reply cannot be read, and
-    `ConnectionError` or `TimeoutError` where there is no reply.
-    """
-
-    metadata: dict[str, Any]
-
-    def request(self, message: Mapping[str, Any]) -> dict[str, Any]: ...
-    def close(self) -> None: ...
 
 
 def open_patiently[T](connect: Callable[[], T], seconds: float) -> T:
@@ -273,3 +261,11 @@ def _decoded(data: Any) -> dict[str, Any]:
     if not isinstance(message, dict):
         raise UserError(f"The server's reply is malformed: {brief(message)} is no map.")
     return message
+
+
+Connection = Client | HttpConnection | HarnessConnection
+"""One connection to a server, with one episode at a time.
+
+Requests raise `UserError` where the server refuses one or its reply cannot be read, and
+`ConnectionError` or `TimeoutError` where there is no reply.
+"""

@@ -284,10 +284,6 @@ class RemotePolicy(Policy):
         if self.protocol.subgoal is not None:
             self.config["subgoal_text"] = {"kind": self.protocol.subgoal}
 
-    @property
-    def embodiment(self) -> Embodiment:
-        return self.protocol.robot
-
     def start_episode(self, goal: str, seed: int = 0) -> RemoteEpisode:
         episode = RemoteEpisode(self, goal, seed)
         self._episodes.add(episode)

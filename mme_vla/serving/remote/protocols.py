@@ -103,7 +103,7 @@ class ServerProtocol:
     shares_memory: ClassVar[bool] = False
     stateless: ClassVar[bool] = False
     executes_all: ClassVar[bool] = False
-    connection_type: type[Client] | type[HttpConnection] | type[HarnessConnection] = Client
+    connection_type: type[Connection] = Client
 
     def __init__(self, choice: ServerChoice, robot: Embodiment) -> None:
         """Take the robot of the command; `describe` may replace it by the server's."""
