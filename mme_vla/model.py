@@ -23,11 +23,12 @@ From image to loss in the order of the calls, with FrameSamp and Modulator:
     ModulatorLayer.forward     integration/modulator.py: the hook, before the MLP
     masked_mean                here: the mean over steps and samples
 
-A memory works in two steps. `select` (memory/framesamp.py) chooses stored tokens of a history
-(memory/history.py) and `MemoryModule.forward` encodes them. In training the dataset selects, which
-makes `Batch.history`, and `memory_tokens` encodes. In an episode `MMEPolicy.encode_memories` does
-both, and `Batch.history` is None. The stored tokens come from the vision tower and `pool_grid`
-(`policy/network.py`, `encode_frames`), in training from the vision cache.
+A memory works in two steps. `select` (memory/base.py, of the frames that memory/framesamp.py names)
+chooses stored tokens of a history (memory/history.py) and `MemoryModule.forward` encodes them. In
+training the dataset selects, which makes `Batch.history`, and `memory_tokens` encodes. In an
+episode `MMEPolicy.encode_memories` does both, and `Batch.history` is None. The stored tokens come
+from the vision tower and `pool_grid` (`policy/network.py`, `encode_frames`), in training from the
+vision cache.
 
 Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
 """

@@ -464,6 +464,26 @@ class PerceptualMemory(MemoryModule):
         return MemoryTokens(tokens, history.mask, ages=history.ages)
 
 
+class FrameMemory(MemoryModule):
+    """Selects all tokens of the frames that a subclass names."""
+
+    lazy = True  # most frames are never selected
+
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
+        """The frames that are read at `step` of an episode whose execution begins at `exec_start`;
+        int64, ascending.
+        """
+        raise NotImplementedError
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        return union_frames([self.selected_frames(int(step), exec_start) for step in steps])
+
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
+        return all_patches(self.selected_frames(step, history.exec_start), self.storage.grid)
+
+
 def check_scorer(memory: "Memory") -> None:
     """Check that a cache stores scores under the key of the scorer that the memory makes.
 

@@ -1,12 +1,11 @@
 """FrameSamp: whole frames, evenly spaced over video and execution alike (paper, section 4.2)."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.base import FrameMemory, PerceptualMemory
+from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
 
@@ -33,8 +32,10 @@ def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> 
 
 
 @MEMORIES.register("framesamp")
-class FrameSamp(PerceptualMemory):
+class FrameSamp(FrameMemory, PerceptualMemory):
     """budget / grid² frames of grid×grid tokens each: 32 frames of 16 tokens as released."""
+
+    lazy = False  # along an episode most frames are selected
 
     def __init__(
         self,
@@ -56,14 +57,6 @@ class FrameSamp(PerceptualMemory):
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         self.frames = frames
 
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.selected_frames(int(step)) for step in steps])
-
-    def select(
-        self, history: History, step: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        return all_patches(self.selected_frames(step), self.storage.grid)
-
-    def selected_frames(self, step: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int = 0) -> np.ndarray:
         """The frames remembered at `step`: evenly spaced among those that are stored."""
         return evenly_spaced_stored_frames(self.storage, step, self.frames)

@@ -304,16 +304,17 @@ class OnlineHistory(History):
         self._length = 0
         self._stored_frames: list[int] = []
         self._tokens: Tensor | None = None
-        self._scores = FrameScores.empty(spec.grid**2)
-        self._n_scores = 0  # rows in use
+        self._scored_frames: list[int] = []
+        self._score_rows: list[np.ndarray] = []
 
     def __len__(self) -> int:
         return self._length
 
     @property
     def scores(self) -> FrameScores:
-        count = self._n_scores
-        return FrameScores(self._scores.frames[:count], self._scores.values[:count])
+        empty = np.zeros((0, self.spec.grid**2), np.float32)
+        values = np.vstack([empty, *self._score_rows])
+        return FrameScores(np.array(self._scored_frames, np.int64), values)
 
     @property
     def stored_frames(self) -> np.ndarray:
@@ -387,20 +388,9 @@ class OnlineHistory(History):
             return
         for frame, image in zip((offsets + self._length).tolist(), frames, strict=True):
             values = self._scorer(frame, image)
-            if values is None:
-                continue
-            # The arrays double where they are full.
-            row = self._n_scores
-            if row == len(self._scores.frames):
-                more = max(row, 16)
-                empty = np.zeros((more, len(values)), np.float32)
-                self._scores = FrameScores(
-                    np.concatenate([self._scores.frames, np.zeros(more, np.int64)]),
-                    np.concatenate([self._scores.values, empty]),
-                )
-            self._scores.frames[row] = frame
-            self._scores.values[row] = values
-            self._n_scores += 1
+            if values is not None:
+                self._scored_frames.append(frame)
+                self._score_rows.append(np.array(values, np.float32))
 
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:

@@ -21,11 +21,10 @@ from mme_vla.config.devices import float32_products
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import (
     FeatureEncoder,
-    MemoryModule,
+    FrameMemory,
     all_patches,
     take_options,
     token_positions,
-    union_frames,
 )
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -106,7 +105,7 @@ def jittered(
 
 @dataclass(frozen=True)
 class FrameSchedule:
-    """Options of a recurrent memory: which frames it reads.
+    """Which frames a recurrent memory reads: its options.
 
     max_steps, max_video, stride, every: see `recurrent_frames`.
     jitter: in training, past frames move at random by up to this many frames, if the data hand over
@@ -139,6 +138,15 @@ class FrameSchedule:
         return recurrent_frames(
             step, exec_start, self.max_steps, self.max_video, self.stride, self.every
         )
+
+
+class ScheduledMemory(FrameMemory):
+    """Reads the frames that its `schedule` names."""
+
+    schedule: FrameSchedule
+
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
+        return self.schedule.frames(step, exec_start)
 
 
 State = tuple[Tensor, ...]
@@ -248,7 +256,7 @@ class RecurrentLayer(nn.Module):
         return {}
 
 
-class RecurrentMemory(MemoryModule):
+class RecurrentMemory(ScheduledMemory):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer.
 
     Besides its own arguments it takes those of `FrameSchedule` and `FeatureEncoder`.
@@ -258,7 +266,6 @@ class RecurrentMemory(MemoryModule):
     """
 
     option_types: ClassVar[tuple[type, ...]] = (FrameSchedule, FeatureEncoder)
-    lazy = True
     float32_products: str = "ieee"
 
     def __init__(
@@ -312,13 +319,10 @@ class RecurrentMemory(MemoryModule):
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
         """Frames read at `step`, ascending; the last is `step`."""
-        frames = self.schedule.frames(step, history.exec_start)
+        frames = self.selected_frames(step, history.exec_start)
         if rng is None or not self.schedule.jitter:
             return frames
         return jittered(frames, history.exec_start, self.schedule.jitter, rng)
-
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.schedule.frames(int(step), exec_start) for step in steps])
 
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None

@@ -70,8 +70,12 @@ class IncomparableError(UserError):
 
 
 @dataclass(frozen=True)
-class _About:
-    """Words in the header of the file's tensors."""
+class About:
+    """Words in the header of the file's tensors.
+
+    options: of policies that choose.
+    precision: of the weights and the computation.
+    """
 
     format: Literal["mme_vla self-check 1"]
     goal: str
@@ -91,8 +95,6 @@ class SelfCheck:
     noise: of `Policy.sampling_noise`.
     chunk: [h, a] float32, in the network's units.
     actions: [h, w] float32, the chunk as the robot executes it.
-    options: of policies that choose.
-    precision: of the weights and the computation.
     """
 
     views: Mapping[str, np.ndarray]
@@ -102,10 +104,7 @@ class SelfCheck:
     noise: Mapping[str, Tensor]
     chunk: np.ndarray
     actions: np.ndarray
-    goal: str
-    options: tuple[str, ...]
-    precision: Literal["float32", "bfloat16"]
-    device: str
+    about: About
 
     def write(self, folder: Path) -> str:
         """Write the file into a checkpoint and return its name."""
@@ -127,9 +126,8 @@ class SelfCheck:
             tensors[_VIEW + name] = torch.from_numpy(view)
         for name, noise in self.noise.items():
             tensors[_NOISE + name] = noise.contiguous()
-        about = _About(FORMAT, self.goal, self.options, self.precision, self.device)
         # One text: the order of several is not defined.
-        return save(tensors, {_ABOUT: json.dumps(asdict(about), sort_keys=True)})
+        return save(tensors, {_ABOUT: json.dumps(asdict(self.about), sort_keys=True)})
 
 
 @dataclass(frozen=True)
@@ -208,10 +206,13 @@ def record_self_check(policy: "Policy") -> SelfCheck:
         noise=policy.sampling_noise(torch.Generator().manual_seed(_SEED)),
         chunk=empty,
         actions=empty,
-        goal=_GOAL,
-        options=_OPTIONS if robot.action.choice else (),
-        precision=_precision_of(policy),
-        device=policy.device.type,
+        about=About(
+            FORMAT,
+            _GOAL,
+            _OPTIONS if robot.action.choice else (),
+            _precision_of(policy),
+            policy.device.type,
+        ),
     )
     chunk, actions = predict_chunk(policy, history)
     check = replace(history, chunk=chunk, actions=actions)
@@ -248,7 +249,7 @@ def renew_self_check(policy: "Policy", dtype: str) -> SelfCheck | None:
         warnings.warn(f"saved without a self-check: {reason}", stacklevel=3)
         return None
     if dtype == "bfloat16":
-        check = replace(check, precision="bfloat16")
+        check = replace(check, about=replace(check.about, precision="bfloat16"))
     return check
 
 
@@ -301,10 +302,7 @@ def read_self_check(folder: Path) -> SelfCheck | None:
         noise=noise,
         chunk=tensors[_CHUNK].numpy(),
         actions=tensors[_ACTIONS].numpy(),
-        goal=about.goal,
-        options=about.options,
-        precision=about.precision,
-        device=about.device,
+        about=about,
     )
 
 
@@ -322,7 +320,7 @@ def compare(policy: "Policy", folder: Path) -> Comparison | None:
     robot = policy.embodiment
     names = {*robot.camera_names, *robot.readings}
     require(
-        check.views.keys() == names and len(check.options) <= len(robot.action.choice),
+        check.views.keys() == names and len(check.about.options) <= len(robot.action.choice),
         f"{folder / FILE} does not fit this policy: it holds other cameras or options.",
     )
     expected = policy.sampling_noise(torch.Generator().manual_seed(_SEED))
@@ -350,13 +348,13 @@ def compare(policy: "Policy", folder: Path) -> Comparison | None:
         )
     precision = _precision_of(policy)
     tolerance = FLOAT32_TOLERANCE
-    if "bfloat16" in (precision, check.precision):
+    if "bfloat16" in (precision, check.about.precision):
         tolerance = BFLOAT16_TOLERANCE
     return Comparison(
         chunk=relative_difference(chunk, check.chunk),
         actions=relative_difference(actions, check.actions),
         tolerance=tolerance,
-        recorded=f"{check.precision}, {check.device}",
+        recorded=f"{check.about.precision}, {check.about.device}",
         current=f"{precision}, {policy.device.type}",
     )
 
@@ -384,12 +382,12 @@ def predict_chunk(
     devices = [policy.device] if policy.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), _inference(policy):
         torch.manual_seed(_SEED)  # of what is sampled beside the noise
-        episode = policy.start_episode(check.goal, _SEED)
+        episode = policy.start_episode(check.about.goal, _SEED)
         if policy.require_processor().prompt_spec.reads_subgoal:
-            episode.subgoal = check.goal
+            episode.subgoal = check.about.goal
         episode.options = tuple(
             Option(chr(ord("a") + number), text, needs_point=True)
-            for number, text in enumerate(check.options)
+            for number, text in enumerate(check.about.options)
         )
         past_actions = None
         if policy.embodiment.action.frames is not None:
@@ -438,14 +436,14 @@ def _layout(noise: Mapping[str, Tensor]) -> dict[str, tuple[torch.Size, torch.dt
     return {name: (tensor.shape, tensor.dtype) for name, tensor in noise.items()}
 
 
-def _read_about(path: Path) -> _About:
+def _read_about(path: Path) -> About:
     from safetensors import safe_open
 
     with safe_open(path, "pt") as opened:
         text = (opened.metadata() or {}).get(_ABOUT)
     require(text is not None, f"{path} is no self-check: it has no description.")
     assert text is not None
-    return read_section(_About, parse_json(text, f"The description of {path}"), str(path))
+    return read_section(About, parse_json(text, f"The description of {path}"), str(path))
 
 
 def _synthetic_views(robot: Embodiment) -> dict[str, np.ndarray]:

@@ -1,15 +1,14 @@
 """Folders of safetensors: large ones are sharded, and reading is strict."""
 
 import shutil
-import stat
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, brief, check_choice, counted, listed, require
-from mme_vla.utils import check_sums, checked_file, inside, read_json
+from mme_vla.errors import UserError, check_choice, counted, listed, require
+from mme_vla.utils import check_sums, checked_file, decoding, inside, read_json, require_file
 
 WEIGHTS = "model.safetensors"
 INDEX = "model.safetensors.index.json"
@@ -149,40 +148,25 @@ def check_transformers_folder(source: str | Path) -> None:
 
 
 def read_safetensors(file: Path) -> dict[str, Tensor]:
-    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     check_header(file)
-    try:
+    with decoding(file, "a safetensors file", "Download or copy it again."):
         return load_file(file)
-    except (
-        SafetensorError,
-        OSError,
-        ValueError,
-        KeyError,
-        RuntimeError,
-    ) as error:  # KeyError: a dtype torch has not
-        raise UserError(
-            f"{file} is damaged or not a safetensors file: {brief(str(error), 300, quote=False)}"
-        ) from error
 
 
 def check_header(file: Path) -> None:
     """Make sure that a safetensors file is one, and that its header is of a size worth parsing."""
-    try:
-        about = file.stat()
-        require(stat.S_ISREG(about.st_mode), f"{file} is not a file; expected safetensors.")
-        with file.open("rb") as opened:
-            header = int.from_bytes(opened.read(8), "little")
-    except OSError as error:
-        label = brief(str(file), 300, quote=False)  # an index may give a name of any length
-        raise UserError(
-            f"{label} cannot be read as a safetensors file: {error.strerror or error}."
-        ) from None
+    size = require_file(file, "a safetensors file").stat().st_size
+    with (
+        decoding(file, "a safetensors file", "Download or copy it again."),
+        file.open("rb") as opened,
+    ):
+        header = int.from_bytes(opened.read(8), "little")
     require(
-        header <= min(_HEADER_LIMIT, about.st_size - 8),
+        header <= min(_HEADER_LIMIT, size - 8),
         f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the"
-        f" file has {about.st_size:,}, and headers have at most {_HEADER_LIMIT:,}.",
+        f" file has {size:,}, and headers have at most {_HEADER_LIMIT:,}.",
     )
 
 

@@ -34,6 +34,10 @@ from mme_vla.utils import is_text
 from mme_vla.utils.validation import described, validated
 
 
+def _integer(value: Any) -> Any:
+    return int(value) if isinstance(value, np.integer) else value
+
+
 @dataclass(frozen=True)
 class Reset:
     """Forget the episode and begin another.
@@ -41,7 +45,7 @@ class Reset:
     seed: of its noise; None for the server's.
     """
 
-    seed: int | None = None
+    seed: Annotated[StrictInt, Field(ge=0, lt=2**63), BeforeValidator(_integer)] | None = None
 
 
 @dataclass(frozen=True)
@@ -216,10 +220,6 @@ def _flag(value: Any) -> Any:
     return _truth(value)
 
 
-def _integer(value: Any) -> Any:
-    return int(value) if isinstance(value, np.integer) else value
-
-
 Image = Annotated[np.ndarray, PlainValidator(_image)]
 Text = Annotated[str, PlainValidator(_text)]
 Goal = Annotated[Text, AfterValidator(_goal)]
@@ -244,12 +244,6 @@ Index = Annotated[StrictInt, Field(ge=0), BeforeValidator(_integer)]
 class Flags(BaseModel):
     reset: Flag = False
     add_buffer: Flag = False
-
-
-class ResetMessage(BaseModel):
-    """`{"reset": True}`, with the seed of the episode's noise if the client chooses it."""
-
-    seed: Annotated[StrictInt, Field(ge=0, lt=2**63), BeforeValidator(_integer)] | None = None
 
 
 class BufferMessage(BaseModel):
@@ -364,8 +358,7 @@ class RequestReader:
             )
         flags = validated(Flags, message, "The request")
         if flags.reset:
-            reset: Any = validated(ResetMessage, message, "The request")
-            return Reset(reset.seed)
+            return validated(Reset, message, "The request")
         if flags.add_buffer:
             return self._add_buffer(message)
         require(

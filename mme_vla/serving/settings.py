@@ -21,22 +21,16 @@ def is_local(host: str) -> bool:
 
 def listen(host: str, port: int) -> socket.socket:
     require(0 <= port < 2**16, f"port={port!r} is no port; choose 0 (any free one) to 65535.")
-    bound = None
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM
-        )[0]
-        bound = socket.socket(family, kind, protocol)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(address)
-        bound.listen()
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        # Of `::`, IPv4 clients too.
+        dualstack = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+        return socket.create_server(address, family=family, dualstack_ipv6=dualstack)
     except OSError as error:
-        if bound is not None:
-            bound.close()
+        reason, _, _ = str(error.strerror).partition(" (")  # which repeats the address
         raise UserError(
-            f"Cannot listen at {host}, port {port} ({error.strerror}); choose others."
+            f"Cannot listen at {host}, port {port} ({reason}); choose others."
         ) from None
-    return bound
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,13 @@ and names the next subgoal.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field, PlainValidator, StrictInt
 
-from mme_vla.errors import brief
+from mme_vla.config.sections import Range
+from mme_vla.errors import UserError, brief
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.models.api import ApiFailure, MediaPart
@@ -25,6 +27,7 @@ from mme_vla.subgoal.text import (
 )
 from mme_vla.subgoal.vocabulary import describe_subgoals, example_of
 from mme_vla.utils import is_text
+from mme_vla.utils.validation import validated
 
 MONITOR = (
     "You watch a robot arm at a table through a camera in front of it, and judge one thing alone:"
@@ -75,11 +78,23 @@ MOST_WORDS = 200  # characters of a text
 MOST_COUNT = 99
 
 
+def _words(value: Any) -> str:
+    text = " ".join(value.split()) if isinstance(value, str) else ""
+    if not text or not is_text(text):
+        raise ValueError("is no text")
+    if len(text) > MOST_WORDS:
+        raise ValueError(f"has more than {MOST_WORDS} characters")
+    return text
+
+
+Words = Annotated[str, PlainValidator(_words)]
+
+
 @dataclass(frozen=True)
 class Count:
     """How often something has been done; a finished subgoal adds at most one."""
 
-    value: int
+    value: Annotated[StrictInt, Range(0, MOST_COUNT)]
 
     def check(self, before: "Count | None", finished: bool) -> None:
         """Raise MalformedReply if this may not follow the note `before`."""
@@ -91,7 +106,7 @@ class Count:
 class Identity:
     """The description of an object that distinguishes it from the others."""
 
-    words: str
+    words: Words
 
     def check(self, before: "Identity | None", finished: bool) -> None:
         """Accept any change: an object that was moved needs another description."""
@@ -101,8 +116,8 @@ class Identity:
 class Route:
     """Steps that never change, and how many are done; a finished subgoal adds at most one."""
 
-    steps: tuple[str, ...]
-    done: int = 0
+    steps: Annotated[tuple[Words, ...], Field(min_length=1, max_length=MOST_STEPS)]
+    done: Annotated[StrictInt, Range(0, MOST_STEPS)] = 0
 
     def check(self, before: "Route | None", finished: bool) -> None:
         """Raise MalformedReply if this may not follow the note `before`."""
@@ -122,6 +137,15 @@ def _check_growth(what: str, before: int, value: int, finished: bool) -> None:
 
 
 Note = Count | Identity | Route
+KINDS: Mapping[str, type[Note]] = {"count": Count, "identity": Identity, "route": Route}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What an entry of an answer has beside the fields of its kind."""
+
+    name: Words
+    kind: Literal["count", "identity", "route"]
 
 
 @dataclass(frozen=True)
@@ -180,43 +204,14 @@ def read_notes(entries: Any) -> list[tuple[str, Note]]:
     if not isinstance(entries, list):
         raise MalformedReply("notes is not a list of objects")
     notes = []
-    for entry in entries[: MOST_NOTES + 1]:
-        if not isinstance(entry, dict):
-            raise MalformedReply("notes is not a list of objects")
-        notes.append((_words(entry.get("name"), "name"), _read_note(entry)))
+    for fields in entries[: MOST_NOTES + 1]:
+        try:
+            entry = validated(Entry, fields, "A note")
+            note = validated(KINDS[entry.kind], fields, "A note")
+        except UserError as error:
+            raise MalformedReply(str(error)) from None
+        notes.append((entry.name, note))
     return notes
-
-
-def _read_note(entry: dict[str, Any]) -> Note:
-    kind = entry.get("kind")
-    if kind == "count":
-        return Count(_integer(entry.get("value"), "value", MOST_COUNT))
-    if kind == "identity":
-        return Identity(_words(entry.get("words"), "words"))
-    if kind == "route":
-        steps = entry.get("steps")
-        if not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS:
-            raise MalformedReply(f"steps is not a list of 1 to {MOST_STEPS} texts")
-        done = _integer(entry.get("done", 0), "done", MOST_STEPS)
-        return Route(tuple(_words(step, "steps") for step in steps), done)
-    raise MalformedReply(
-        f"there are notes of the kinds count, identity and route, not {brief(kind)}"
-    )
-
-
-def _words(value: Any, what: str) -> str:
-    text = " ".join(value.split()) if isinstance(value, str) else ""
-    if not text or not is_text(text):
-        raise MalformedReply(f"the {what} of a note is no text")
-    if len(text) > MOST_WORDS:
-        raise MalformedReply(f"the {what} of a note has more than {MOST_WORDS} characters")
-    return text
-
-
-def _integer(value: Any, what: str, most: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
-        raise MalformedReply(f"the {what} of a note is no whole number from 0 to {most}")
-    return value
 
 
 LONGEST = 200  # frames of a subgoal that are shown: the last ones of a longer one

@@ -4,7 +4,7 @@ update.
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,43 +23,38 @@ class StopRequest:
 
     It is a collective: all processes call it after the same update, so all get the same answer,
     though the signals reach them at different moments or only one of them.
+
+    group: the processes; None for one alone.
     """
 
-    anyone: Callable[[], bool]
+    group: Any = None
     event: threading.Event = field(default_factory=threading.Event)
     signal: int = signal.SIGTERM
     """Which signal this process was asked by; of processes asked by another one, SIGTERM."""
 
     def __call__(self) -> bool:
-        return self.anyone()
+        requested = self.event.is_set()
+        if self.group is None:
+            return requested
+        flag = torch.tensor(int(requested))
+        distributed.all_reduce(flag, distributed.ReduceOp.MAX, self.group)
+        return bool(flag)
 
 
 @contextmanager
 def stop_requests() -> Iterator[StopRequest]:
     """While this is open, Ctrl-C and SIGTERM only ask; a second one ends the process as usual."""
-    request = StopRequest(lambda: request.event.is_set())
-    event = request.event
+    request = StopRequest()
     with _signals_set(request):
-        if not (
-            distributed.is_available()
-            and distributed.is_initialized()
-            and distributed.get_world_size() > 1
-        ):
-            yield request
-            return
-        # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
-        group = distributed.new_group(backend="gloo")
-
-        def anyone() -> bool:
-            flag = torch.tensor(int(event.is_set()))
-            distributed.all_reduce(flag, distributed.ReduceOp.MAX, group)
-            return bool(flag)
-
-        request.anyone = anyone
+        is_started = distributed.is_available() and distributed.is_initialized()
+        if is_started and distributed.get_world_size() > 1:
+            # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
+            request.group = distributed.new_group(backend="gloo")
         try:
             yield request
         finally:
-            distributed.destroy_process_group(group)
+            if request.group is not None:
+                distributed.destroy_process_group(request.group)
 
 
 def leave_signals_alone(worker: int) -> None:

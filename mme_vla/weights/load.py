@@ -74,11 +74,6 @@ def load_weights(
     """
     kind = dtype_of(dtype)
     checkpoint = open_source(source, revision, token, base)
-    require(
-        checkpoint.format != "openpi" or policy.memory is None,
-        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset."
-        " To begin training from it use start_from() (on the command line: init_from=…).",
-    )
     stats = None
     datasets = list(stats_files(checkpoint.folder))
     if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
@@ -101,7 +96,7 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     """Read a checkpoint in the names of a policy of its own variant."""
     if source.format == "ours":
         return merge_state(source.tensors(), PolicySections.of(source.config).adapters)
-    if source.format == "lerobot":
+    if source.format in ("lerobot", "openpi"):
         check_window(policy, source.config, str(source.folder))
     if (of := method_formats().get(source.format)) is not None and of.check is not None:
         of.function("check")(policy, source.config, str(source.folder))

@@ -14,8 +14,7 @@ import math
 import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +38,7 @@ from mme_vla.utils import (
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
 ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
 VARIANT_FILE = "history_config.txt"
+_REMEDY = "Download or copy it again."
 _SMALL_PIECE = 2**20  # numbers
 _DICT_KEY = 2  # Orbax's number for "this step of the path is a dictionary's key"
 
@@ -64,7 +64,7 @@ class Zipped:
         """
         check_sums(self.file.parent, [self.file.name])
         with (
-            decoding(self.file, "a zip archive", "Download or copy it again."),
+            decoding(self.file, "a zip archive", _REMEDY),
             zipfile.ZipFile(self.file) as opened,
         ):
             for name in self.names:
@@ -121,7 +121,7 @@ def read_orbax(
         params.check()
     else:
         _check_files(params)
-    with _reading(params):
+    with decoding(str(params), "an Orbax checkpoint", _REMEDY):
         # All are requested before the first is waited for, so that reading overlaps.
         pending = {}
         for path, (name, driver) in _list_arrays(ts, params).items():
@@ -177,22 +177,8 @@ def _check_files(params: Path) -> None:
 
 def leaf_names(params: Path | Zipped) -> set[str]:
     """The names of a checkpoint's arrays, as `read_orbax` gives them; no array is read."""
-    with _reading(params):
+    with decoding(str(params), "an Orbax checkpoint", _REMEDY):
         return {name for name, _ in _list_arrays(_tensorstore(), params).values()}
-
-
-@contextmanager
-def _reading(params: Path | Zipped) -> Iterator[None]:
-    """Report what tensorstore, or torch, cannot read."""
-    try:
-        yield
-    except UserError:
-        raise
-    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
-        reason = brief(str(error).splitlines()[0], 500, quote=False)
-        raise UserError(
-            f"The Orbax checkpoint {params} is damaged or incomplete: {reason}"
-        ) from error
 
 
 def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
@@ -299,7 +285,6 @@ is no checkpoint.
 """
 _SMALL = 4 * 2**20  # bytes of a file that is unpacked
 _HEADER = 30  # least bytes before the content of a file
-_REMEDY = "Download or copy it again."
 _facts: dict[tuple[Path, int], tempfile.TemporaryDirectory[str]] = {}
 
 

@@ -101,7 +101,7 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
 
 
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
-    """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's."""
+    """Refuse a port of π0.5 whose memory is not this policy's: none, or LeRobot's short window."""
     has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
     if any(has.values()):
         for source_name, (_, default) in WINDOW.items():

@@ -48,11 +48,6 @@ def formats() -> dict[str, str]:
     return FORMATS | {name: of.text for name, of in method_formats().items()}
 
 
-def native_formats() -> list[str]:
-    """Formats in files of `torch.save`; each is called as the model it holds."""
-    return [name for name, of in method_formats().items() if of.native]
-
-
 VARIANTS = {
     "pi05_baseline": "pi05",
     "symbolic-simple-subgoal": "simplesg",
@@ -337,11 +332,12 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
 
 def _of_torch_file(path: Path) -> Source:
     names = list(read_torch_file(path, mapped=True))
-    for name in native_formats():
+    known = [name for name, method in method_formats().items() if method.native]
+    for name in known:
         if method_formats()[name].function("matches")(names):
             return Source(name, path.parent, (path,))
     few = listed(sorted(names), 3)
     raise UserError(
         f"{path} holds no policy known here: its tensors are called {few}. Known:"
-        f" {', '.join(native_formats())}."
+        f" {', '.join(known)}."
     )

@@ -15,7 +15,7 @@ from einops import rearrange
 from torch import Tensor
 
 from mme_vla.backbone.pi05 import Pi05Backbone
-from mme_vla.errors import UserError, counted, listed
+from mme_vla.errors import UserError, counted
 from mme_vla.policy.base import Policy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import check_fit
@@ -107,13 +107,9 @@ def paths_of(table: NameTable) -> set[str]:
 
 
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Translate a foreign checkpoint into our names and layouts."""
-    missing = sorted(paths_of(table) - set(source))
-    if missing:
-        raise UserError(
-            f"The checkpoint lacks {counted(len(missing), 'tensor')} this policy needs:"
-            f" {listed(missing)}"
-        )
+    """Translate a foreign checkpoint, which has all names of the table, into our names and
+    layouts.
+    """
     target = {}
     for name, pieces in table.items():
         try:

@@ -1,6 +1,5 @@
 """A policy as a folder that another library loads: one writer a format."""
 
-import json
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,6 +19,7 @@ from mme_vla.processing.processor import STATS_FILE, Processor
 from mme_vla.processing.prompt import PROMPTS, GoalPrompt
 from mme_vla.processing.tokenizer import HUB
 from mme_vla.registry import PROCESSORS
+from mme_vla.utils import write_json
 from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import VARIANT_FILE, write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
@@ -107,7 +107,7 @@ def _write(folder: Path, name: str, steps: list[Step], stats: NormStats) -> None
             about["state_file"] = f"{name}_step_{i}_{step}.safetensors"
             save_file(tensors, folder / about["state_file"])
         described.append(about)
-    _write_json(folder / f"{name}.json", {"name": name, "steps": described})
+    write_json(folder / f"{name}.json", {"name": name, "steps": described})
 
 
 ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's statistics
@@ -167,7 +167,7 @@ def write_lerobot(
         "use_relative_actions": bool(robot.action.relative),
         "relative_exclude_joints": absolute,
     }
-    _write_json(folder / "config.json", about)
+    write_json(folder / "config.json", about)
     reason = write_pipelines(policy, folder, about, stats)
     if reason is not None:
         warnings.warn(
@@ -189,7 +189,7 @@ def write_openpi(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormSt
         **_SIZES,
         "precision": _name(dtype),
     }
-    _write_json(folder / "config.json", about)
+    write_json(folder / "config.json", about)
     tensors = to_openpi(policy, policy.state_dict())
     # of a tied pair, safetensors' save_model keeps the first name; its load_model wants no more
     del tensors[EMBEDDING]
@@ -249,10 +249,6 @@ def _write_assets(folder: Path, stats: NormStats | None) -> None:
     if stats is not None:
         (folder / "assets" / ASSET).mkdir(parents=True)
         stats.save(folder / "assets" / ASSET / STATS_FILE)
-
-
-def _write_json(file: Path, content: dict[str, Any]) -> None:
-    file.write_text(json.dumps(content, indent=2) + "\n")
 
 
 def _name(dtype: torch.dtype) -> str:

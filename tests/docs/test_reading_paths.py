@@ -21,7 +21,7 @@ def test_the_page_on_the_layout_has_the_counted_numbers() -> None:
             500,
             [
                 ("policy/network.py", "NetworkPolicy.encode_frames"),
-                ("memory/framesamp.py", "FrameSamp.select"),
+                ("memory/framesamp.py", "FrameSamp.selected_frames"),
                 ("model.py", "MMEModel.loss"),
                 ("integration/modulator.py", "ModulatorLayer.forward"),
                 ("backbone/flow.py", "step_loss"),

@@ -260,7 +260,7 @@ def test_missing_pieces_of_an_array_are_errors_and_not_zeros(tmp_path: Path) -> 
     folder = tmp_path / "plain"
     shutil.copytree(Path(__file__).resolve().parents[1] / "data" / "orbax_plain", folder)
     (folder / "scale" / "0").unlink()
-    with pytest.raises(UserError, match="damaged or incomplete"):
+    with pytest.raises(UserError, match="damaged: it cannot be read as an Orbax checkpoint"):
         read_orbax(folder)
 
 

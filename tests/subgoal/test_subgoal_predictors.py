@@ -13,7 +13,8 @@ from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal import Memer, Oracle, QwenVL, build_predictor
 from mme_vla.subgoal.clips import Clip
-from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
+from mme_vla.subgoal.models.qwen3vl import VLM, Question
+from mme_vla.subgoal.models.replies import Reply
 from mme_vla.subgoal.models.tiny import make_tiny
 
 pytest.importorskip("transformers", reason="needs the extra vlm")
@@ -27,7 +28,7 @@ class Scripted:
 
     def generate(self, questions, max_new_tokens):
         self.batches.append(list(questions))
-        return [Completion(self.answers.pop(0), 100, 7) for _ in questions]
+        return [Reply(self.answers.pop(0), 100, 7) for _ in questions]
 
 
 frames = partial(subgoal_fakes.frames, size=256)

@@ -112,7 +112,7 @@ def write(file: Path, **contents: bytes) -> Path:
             "unpacks to 20,000,000 bytes",
         ),
         ({"notes.txt": b"x"}, "no Orbax arrays"),
-        ({"params/manifest.ocdbt": b"x"}, "is damaged or incomplete"),
+        ({"params/manifest.ocdbt": b"x"}, "is damaged: it cannot be read as an Orbax checkpoint"),
         (
             {"params/manifest.ocdbt": b"x", "assets/a b/norm_stats.json": b"{}"},
             "cannot name a folder",

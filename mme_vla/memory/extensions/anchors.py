@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import check_sizes
-from mme_vla.memory.base import PerceptualMemory
-from mme_vla.memory.extensions.attending import FrameMemory
+from mme_vla.memory.base import FrameMemory, PerceptualMemory
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import check_every, recurrent_frames
 from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames

@@ -1,18 +1,12 @@
-"""Parts that memories share: a small pre-norm transformer block in which some tokens read others,
-and the base of memories that select whole frames.
-"""
+"""Parts of memories: a small pre-norm transformer block in which some tokens read others."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import MemoryModule, all_patches, union_frames
-from mme_vla.memory.history import History
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.speed import fused_kernels
 
@@ -92,23 +86,3 @@ def rows_at(x: Tensor, at: Tensor) -> Tensor:
     """The rows at [b, k] of x [b, n, …]: [b, k, …]."""
     index = at.view(*at.shape, *[1] * (x.ndim - 2))
     return torch.gather(x, 1, index.expand(-1, -1, *x.shape[2:]))
-
-
-class FrameMemory(MemoryModule):
-    """Selects all tokens of the frames that a subclass names."""
-
-    lazy = True  # most frames are never selected
-
-    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
-        """The frames that are read at `step` of an episode whose execution begins at `exec_start`;
-        int64, ascending.
-        """
-        raise NotImplementedError
-
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.selected_frames(int(step), exec_start) for step in steps])
-
-    def select(
-        self, history: History, step: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        return all_patches(self.selected_frames(step, history.exec_start), self.storage.grid)

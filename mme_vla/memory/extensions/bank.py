@@ -6,15 +6,14 @@ itself computed from a frame. The tokens of the current frame are the queries.
 
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import check_choice, check_sizes, require
-from mme_vla.memory.extensions.attending import FrameMemory, by_frame
+from mme_vla.memory.extensions.attending import by_frame
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import check_every, default_hidden, recurrent_frames
+from mme_vla.memory.recurrent import FrameSchedule, ScheduledMemory, default_hidden
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -231,7 +230,7 @@ class MemoryBank(Retrieval):
 
 
 @MEMORIES.register("bank")
-class Banked(FrameMemory):
+class Banked(ScheduledMemory):
     """grid×grid tokens of the current frame, each fused with what it retrieves from the bank.
 
     Besides its own options it takes those of `MemoryBank`.
@@ -268,8 +267,7 @@ class Banked(FrameMemory):
             bank: options of the `MemoryBank`.
         """
         super().__init__()
-        check_sizes("memory", grid=grid, stride=stride, video=video)
-        check_every(every, stride)
+        check_sizes("memory", grid=grid, video=video)
         require(
             1 < moments > video,
             f"memory.moments={moments} must be at least 2, and more than memory.video={video}.",
@@ -282,17 +280,10 @@ class Banked(FrameMemory):
         self.budget = grid**2
         self.capacity = moments * grid**2
         self.storage = StorageSpec(grid, pooling)
-        self.moments = moments
-        self.video = video
-        self.stride = stride
-        self.every = every
+        self.schedule = FrameSchedule(moments, video, stride, every)
         self.reduce = nn.Linear(d_vision, hidden)
         self.output = nn.Linear(hidden, width)
         self.bank = MemoryBank(hidden, **bank)
-
-    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
-        """The moments at `step`, the last of them `step` itself."""
-        return recurrent_frames(step, exec_start, self.moments, self.video, self.stride, self.every)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2

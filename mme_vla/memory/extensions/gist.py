@@ -17,9 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import FeatureEncoder, take_options
+from mme_vla.memory.base import FeatureEncoder, FrameMemory, take_options
 from mme_vla.memory.extensions.attending import (
-    FrameMemory,
     ReaderOptions,
     ReadingBlock,
     by_frame,

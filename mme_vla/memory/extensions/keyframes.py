@@ -9,7 +9,6 @@ is a keyframe where one has begun since the stored frame before it. Without labe
 alone trains it, through a straight-through sigmoid as in `learned_topk`.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
+from mme_vla.memory.base import FrameMemory, PerceptualMemory
 from mme_vla.memory.extensions.attending import by_frame, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_stored_frames
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import default_hidden, full_precision, linear
 from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
@@ -31,10 +30,12 @@ LARGE = 1e4  # beyond any score
 
 
 @MEMORIES.register("keyframes")
-class Keyframes(PerceptualMemory, ReadsLabels):
+class Keyframes(FrameMemory, PerceptualMemory, ReadsLabels):
     """The first frame, the newest stored one, and `budget / grid² − 2` that the head is most
     certain of.
     """
+
+    lazy = False  # along an episode the head reads most frames
 
     def __init__(
         self,
@@ -75,18 +76,11 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         self.read = nn.Linear(2 * d_vision, hidden)
         self.write = nn.Linear(hidden, 1)
 
-    def selected_frames(self, step: int) -> np.ndarray:
-        """The frames that the head reads at `step`, ascending, the newest stored one among them."""
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
+        """The frames that the head reads at `step`, ascending, the newest stored one among them;
+        `forward` keeps some of them.
+        """
         return evenly_spaced_stored_frames(self.storage, step, self.pool)
-
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.selected_frames(int(step)) for step in steps])
-
-    def select(
-        self, history: History, step: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        """The candidates: `forward` keeps some of them."""
-        return all_patches(self.selected_frames(step), self.storage.grid)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2

@@ -12,7 +12,6 @@ time, so that their slots say little: take `integration.memory_position=time`, a
 `configs/model/learned_topk_*` do.
 """
 
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,14 +21,12 @@ from torch import Tensor, nn
 from mme_vla.errors import require
 from mme_vla.memory.base import (
     FeatureEncoder,
-    MemoryModule,
-    all_patches,
+    FrameMemory,
     take_options,
-    union_frames,
 )
 from mme_vla.memory.extensions.attending import ReaderOptions, ReadingBlock, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_stored_frames
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.history import StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -38,13 +35,14 @@ EPS = 1e-4
 
 
 @MEMORIES.register("learned_topk")
-class LearnedTopK(MemoryModule):
+class LearnedTopK(FrameMemory):
     """The budget − 1 best tokens of `pool` evenly spaced frames, in the order of time, and one for
     all the others.
     """
 
     option_types: ClassVar[tuple[type, ...]] = (ReaderOptions, FeatureEncoder)
     timed = True
+    lazy = False  # along an episode most frames compete
 
     def __init__(
         self,
@@ -98,17 +96,8 @@ class LearnedTopK(MemoryModule):
         self.score = nn.Linear(hidden, 1)
         self.encoder = FeatureEncoder(d_vision, width, **options)
 
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.selected_frames(int(step)) for step in steps])
-
-    def select(
-        self, history: History, step: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        """The candidates: `forward` keeps some of them."""
-        return all_patches(self.selected_frames(step), self.storage.grid)
-
-    def selected_frames(self, step: int) -> np.ndarray:
-        """The frames whose tokens compete at `step`."""
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
+        """The frames whose tokens compete at `step`; `forward` keeps some of the tokens."""
         return evenly_spaced_stored_frames(self.storage, step, self.pool)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:

@@ -13,27 +13,25 @@ as its budget holds.
 
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import nn
 
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import FeatureEncoder, take_options
 from mme_vla.memory.extensions.attending import (
-    FrameMemory,
     ReaderOptions,
     ReadingBlock,
     by_frame,
     not_later,
 )
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import check_every, recurrent_frames
+from mme_vla.memory.recurrent import FrameSchedule, ScheduledMemory
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("moment")
-class Moment(FrameMemory):
+class Moment(ScheduledMemory):
     """`moments` tokens of each of budget / moments frames, every token knowing the frames before
     its own.
     """
@@ -68,8 +66,7 @@ class Moment(FrameMemory):
                 `positions` of the `FeatureEncoder`.
         """
         super().__init__()
-        check_sizes("memory", moments=moments, stride=stride)
-        check_every(every, stride)
+        check_sizes("memory", moments=moments)
         require(
             budget % moments == 0 < budget,
             f"memory.budget={budget} must be a multiple of memory.moments={moments}.",
@@ -78,22 +75,16 @@ class Moment(FrameMemory):
         hidden, heads = causal.sizes(d_vision)
         self.budget = budget
         self.moments = moments
-        self.steps = budget // moments
-        self.stride = stride
-        self.every = every
+        steps = budget // moments
+        self.schedule = FrameSchedule(steps, max(5 * steps // 8, 1), stride, every)
         self.storage = StorageSpec(grid, pooling)
-        self.capacity = self.steps * grid**2
+        self.capacity = steps * grid**2
         self.encoder = FeatureEncoder(d_vision, hidden, **options)
         self.questions = nn.Parameter(torch.randn(moments, hidden) * hidden**-0.5)
         self.ask = ReadingBlock(hidden, heads)
         self.layers = nn.ModuleList(ReadingBlock(hidden, heads) for _ in range(causal.layers))
         self.norm = nn.LayerNorm(hidden)
         self.output = nn.Linear(hidden, width)
-
-    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
-        """The frames read at `step`, the last of them `step`."""
-        max_video = max(5 * self.steps // 8, 1)
-        return recurrent_frames(step, exec_start, self.steps, max_video, self.stride, self.every)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2

@@ -3,22 +3,19 @@
 A control: a policy with it has the parameters and the updates of one with a memory, and no past.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.base import FrameMemory, PerceptualMemory
+from mme_vla.memory.history import StorageSpec
 from mme_vla.registry import MEMORIES
 
 
 @MEMORIES.register("present")
-class Present(PerceptualMemory):
+class Present(FrameMemory, PerceptualMemory):
     """grid² tokens of the current frame."""
-
-    lazy = True
 
     def __init__(
         self,
@@ -43,10 +40,5 @@ class Present(PerceptualMemory):
         )
         super().__init__(d_vision, width, grid**2, StorageSpec(grid, pooling), **encoder)
 
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([np.asarray(steps, np.int64)])
-
-    def select(
-        self, history: History, step: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        return all_patches(np.array([step]), self.storage.grid)
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
+        return np.array([step])

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import PerceptualMemory
-from mme_vla.memory.extensions.attending import FrameMemory
+from mme_vla.memory.base import FrameMemory, PerceptualMemory
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.sizes import budget_frames
 from mme_vla.registry import MEMORIES

@@ -9,7 +9,7 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -23,23 +23,10 @@ from mme_vla.serving.client import (
     key_header,
     open_socket,
 )
-from mme_vla.serving.codec import MOST_TEXT, check_size, msgpack, pack, read_array
+from mme_vla.serving.codec import encode, msgpack, pack, read_array, unpack
 
 PAUSE_S = 0.5  # between two attempts to open a connection
 STARTUP_S = 2.0  # in which a server that sends its metadata first has sent them
-
-
-class Connection(Protocol):
-    """One connection to a server, with one episode at a time.
-
-    Requests raise `UserError` where the server refuses one or its reply cannot be read, and
-    `ConnectionError` or `TimeoutError` where there is no reply.
-    """
-
-    metadata: dict[str, Any]
-
-    def request(self, message: Mapping[str, Any]) -> dict[str, Any]: ...
-    def close(self) -> None: ...
 
 
 def open_patiently[T](connect: Callable[[], T], seconds: float) -> T:
@@ -252,17 +239,10 @@ class HarnessConnection:
 
 
 def _encode(value: Any) -> Any:
-    """An array as the harness has it: the keys are texts, not bytes."""
-    if isinstance(value, np.ndarray):
-        return {
-            "__ndarray__": True,
-            "data": value.tobytes(),
-            "dtype": value.dtype.str,
-            "shape": list(value.shape),
-        }
+    """An array as the harness has it: the keys are texts, not bytes, and scalars are numbers."""
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"{type(value).__name__} has no form in msgpack")
+    return {key.decode(): entry for key, entry in encode(value).items()}
 
 
 def _decoded(data: Any) -> dict[str, Any]:
@@ -275,17 +255,17 @@ def _decoded(data: Any) -> dict[str, Any]:
         return fields
 
     try:
-        check_size(data)
-        message = msgpack.unpackb(data, object_hook=array, max_str_len=MOST_TEXT, max_ext_len=0)
-    except Exception as error:  # msgpack raises many kinds of exception
+        message = unpack(data, array)
+    except UserError as error:
         raise UserError(f"The server's reply is malformed: {error}") from error
     if not isinstance(message, dict):
         raise UserError(f"The server's reply is malformed: {brief(message)} is no map.")
     return message
 
 
-def open_websocket(
-    url: str, api_key: str | None, timeout: float, open_timeout: float
-) -> Connection:
-    """Connect to a server that sends its metadata first."""
-    return Client(url, api_key=api_key, timeout=timeout, open_timeout=open_timeout)
+Connection = Client | HttpConnection | HarnessConnection
+"""One connection to a server, with one episode at a time.
+
+Requests raise `UserError` where the server refuses one or its reply cannot be read, and
+`ConnectionError` or `TimeoutError` where there is no reply.
+"""

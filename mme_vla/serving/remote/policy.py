@@ -83,9 +83,8 @@ class RemoteEpisode(Episode):
         self._views: list[Mapping[str, Any]] = []
         self._states: list[np.ndarray] = []
         self._n_video = 0
-        self._leading: list[np.ndarray] | None = []
+        self._leading: list[np.ndarray] = []
         self._current: Mapping[str, Any] = {}
-        self._state = np.zeros(0, np.float32)
         self.connection: Connection | None = None
         self._failure: Failure | None = None
 
@@ -114,9 +113,8 @@ class RemoteEpisode(Episode):
         self._states.append(np.asarray(states, np.float32))
         if count:
             self._current = {name: view[-1] for name, view in views.items()}
-            self._state = self._states[-1][-1]
         self._n_video += int(np.broadcast_to(np.asarray(is_demo, bool), (count,)).sum())
-        if actions is not None and self._leading is not None:
+        if actions is not None:
             self._leading.append(np.asarray(actions, np.float32))
 
     def take_frames(self) -> NewFrames:
@@ -137,7 +135,7 @@ class RemoteEpisode(Episode):
             views=views,
             states=np.concatenate(self._states),
             current=self._current,
-            state=self._state,
+            state=self.state.numpy(),
             n_video=self._n_video,
             executed=executed,
             first=self.connection is None,
@@ -285,10 +283,6 @@ class RemotePolicy(Policy):
         }
         if self.protocol.subgoal is not None:
             self.config["subgoal_text"] = {"kind": self.protocol.subgoal}
-
-    @property
-    def embodiment(self) -> Embodiment:
-        return self.protocol.robot
 
     def start_episode(self, goal: str, seed: int = 0) -> RemoteEpisode:
         episode = RemoteEpisode(self, goal, seed)

@@ -20,13 +20,13 @@ from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS
 from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.serving.client import Client
 from mme_vla.serving.remote.connections import (
     STARTUP_S,
     Connection,
     HarnessConnection,
     HttpConnection,
     open_patiently,
-    open_websocket,
 )
 from mme_vla.serving.remote.settings import ServerChoice, Subgoals
 from mme_vla.serving.requests import IMAGE_KEYS
@@ -96,13 +96,14 @@ class ServerProtocol:
         runs at a time.
     stateless: whether a request that got no reply may be sent again on another connection.
     executes_all: whether the protocol has every action of a chunk executed.
-    listens: whether the policy reads more than the current frame, as far as the protocol can tell.
+    connection_type: the connections it talks over.
     """
 
     name: ClassVar[str]
     shares_memory: ClassVar[bool] = False
     stateless: ClassVar[bool] = False
     executes_all: ClassVar[bool] = False
+    connection_type: type[Connection] = Client
 
     def __init__(self, choice: ServerChoice, robot: Embodiment) -> None:
         """Take the robot of the command; `describe` may replace it by the server's."""
@@ -127,9 +128,12 @@ class ServerProtocol:
 
     def open(self) -> Connection:
         """Open a connection; once, without patience."""
-        connection = self.choice.connection
-        return open_websocket(
-            self.choice.server, connection.api_key, connection.timeout_s, connection.open_s
+        settings = self.choice.connection
+        return self.connection_type(
+            self.choice.server,
+            api_key=settings.api_key,
+            timeout=settings.timeout_s,
+            open_timeout=settings.open_s,
         )
 
     def describe(self, metadata: ServerMetadata) -> None:
@@ -235,14 +239,8 @@ class ChallengeProtocol(ServerProtocol):
             f"The robot {robot.name!r} is not the benchmark's, and protocol={self.name} has no"
             " place for its observations.",
         )
-
-    def open(self) -> Connection:
-        connection = self.choice.connection
         if self.choice.is_http:
-            return HttpConnection(
-                self.choice.server, connection.api_key, connection.timeout_s, connection.open_s
-            )
-        return super().open()
+            self.connection_type = HttpConnection
 
     def act(self, connection: Connection, frames: NewFrames) -> dict[str, Any]:
         # The benchmark's gripper has two fingers that move alike.
@@ -298,14 +296,9 @@ class HarnessProtocol(ServerProtocol):
     """vla-evaluation-harness: one observation, one action. The server cuts its own chunks."""
 
     name = "harness"
+    connection_type = HarnessConnection
     views: ClassVar[Mapping[str, str]] = {CAMERAS[0]: "agentview", CAMERAS[1]: "wrist"}
     """The harness's names of the benchmark's cameras; others keep theirs."""
-
-    def open(self) -> HarnessConnection:
-        connection = self.choice.connection
-        return HarnessConnection(
-            self.choice.server, connection.api_key, connection.timeout_s, connection.open_s
-        )
 
     def describe(self, metadata: ServerMetadata) -> None:
         params = metadata.observation_params
@@ -388,12 +381,13 @@ def detect(choice: ServerChoice) -> Detection:
         return Detection("challenge", "it has HTTP")
 
     # All but the harness's servers send their metadata first.
-    address = (choice.server, connection.api_key, connection.timeout_s)
+    settings: dict[str, Any] = {"api_key": connection.api_key, "timeout": connection.timeout_s}
     briefly = min(STARTUP_S, connection.open_s)
+    connect = partial(Client, choice.server, **settings, open_timeout=briefly)
     try:
-        client = open_patiently(partial(open_websocket, *address, briefly), connection.open_s)
+        client = open_patiently(connect, connection.open_s)
     except TimeoutError:
-        HarnessConnection(*address, connection.open_s).close()
+        HarnessConnection(choice.server, **settings, open_timeout=connection.open_s).close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
         if ServerMetadata.of(client.metadata).server == SERVER_NAME:

@@ -14,6 +14,7 @@ from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean, missing_extra, require
 from mme_vla.policy.tensor_files import check_transformers_folder
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip
+from mme_vla.subgoal.models.replies import Reply
 from mme_vla.subgoal.models.tiny import make_tiny
 from mme_vla.subgoal.text import IMAGE, VIDEO, split_media
 from mme_vla.utils.media import FPS
@@ -58,15 +59,6 @@ class Question:
             reply = [{"type": "text", "text": self.target}]
             messages.append({"role": "assistant", "content": reply})
         return messages
-
-
-@dataclass(frozen=True)
-class Completion:
-    """An answer, special tokens of points kept, and the tokens read and written."""
-
-    text: str
-    input_tokens: int
-    output_tokens: int
 
 
 class VLM:
@@ -154,13 +146,13 @@ class VLM:
         )
 
     @torch.inference_mode()
-    def generate(
-        self, questions: Sequence[Question], max_new_tokens: int = 128
-    ) -> list[Completion]:
-        """Answer greedily. The other questions of a batch change an answer by rounding only."""
+    def generate(self, questions: Sequence[Question], max_new_tokens: int = 128) -> list[Reply]:
+        """Answer greedily; special tokens of points stay. The other questions of a batch change an
+        answer by rounding only.
+        """
         tokenizer = self.processor.tokenizer
         ends = {tokenizer.eos_token_id, tokenizer.pad_token_id}
-        completions: list[Completion] = []
+        completions: list[Reply] = []
         for start in range(0, len(questions), self.batch_size):
             batch = self.encode(questions[start : start + self.batch_size]).to(self.model.device)
             sequences = self.model.generate(
@@ -177,7 +169,7 @@ class VLM:
                 tokens = [token for token in ids if token not in ends]
                 # The marks of points are special tokens and must stay.
                 text = tokenizer.decode(tokens, skip_special_tokens=False).strip()
-                completions.append(Completion(text, length, len(tokens)))
+                completions.append(Reply(text, length, len(tokens)))
         return completions
 
 

@@ -1,13 +1,12 @@
 """A folder of replies: the same question then needs no key, no network and no package."""
 
-import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import UserError
-from mme_vla.utils import read_json, verified, with_checksum, write_atomically
+from mme_vla.utils import read_json, verified, with_checksum, write_json
 
 log = logging.getLogger(__name__)
 MOST_TOKENS = 2**40
@@ -16,7 +15,7 @@ MOST_TOKENS = 2**40
 
 @dataclass(frozen=True)
 class Reply:
-    """A usable reply and the tokens it took; thoughts count as output."""
+    """A reply of a model and the tokens it took; thoughts count as output."""
 
     text: str
     input_tokens: int
@@ -53,7 +52,6 @@ class ReplyCache:
     def write(self, digest: str, reply: Reply) -> None:
         path = self.path(digest)
         try:
-            with write_atomically(path) as draft:
-                draft.write_text(json.dumps(with_checksum(asdict(reply))))
+            write_json(path, with_checksum(asdict(reply)), indent=None)
         except OSError as error:  # such as a full disk: the reply is used all the same
             log.warning("%s cannot be written: %s", path, error.strerror)

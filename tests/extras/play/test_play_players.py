@@ -18,7 +18,7 @@ from mme_vla.extras.play.cli import main
 from mme_vla.extras.play.game import Option
 from mme_vla.extras.play.players import play
 from mme_vla.extras.play.vlm_players import parse_choice
-from mme_vla.subgoal.models.qwen3vl import Completion
+from mme_vla.subgoal.models.replies import Reply
 from mme_vla.subgoal.text import MalformedReply
 
 OPTIONS = (Option("a", "press the block", True), Option("b", "wait", False))
@@ -163,7 +163,7 @@ class Scripted:
 
     def generate(self, questions, max_new_tokens):
         self.queries += questions
-        return [Completion(self.answers.pop(0), 10, 3)]
+        return [Reply(self.answers.pop(0), 10, 3)]
 
 
 def test_every_question_tells_the_full_episode():
