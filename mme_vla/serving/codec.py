@@ -8,7 +8,6 @@ numbers are refused both ways. All else is msgpack with its defaults.
 """
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -35,52 +34,77 @@ def pack(message: Any) -> bytes:
     return packed
 
 
-def unpack(
-    data: bytes | bytearray | memoryview, read_map: Callable[[dict[Any, Any]], Any] | None = None
-) -> Any:
-    """Decode a message. Arrays are read-only views on `data`: copy what is written to.
-
-    Args:
-        read_map: makes of each map what it stands for; by default an array or a scalar where its
-            keys say so.
-    """
-    read_map = read_map or _decode
-    total = 1
-
-    # An empty map takes one byte in a message and 64 in memory.
-    def count(more: int) -> None:
-        nonlocal total
-        total += more
-        if total > MOST_OBJECTS:
-            raise UserError(
-                f"The message holds more than {MOST_OBJECTS} values; a frame takes about 130. Send"
-                " fewer."
-            )
-
-    def take_map(fields: dict[Any, Any]) -> Any:
-        count(2 * len(fields))
-        return read_map(fields)
-
-    def take_list(values: list[Any]) -> list[Any]:
-        count(len(values))
-        return values
-
+def unpack(data: bytes | bytearray | memoryview) -> Any:
+    """Decode a message. Arrays are read-only views on `data`: copy what is written to."""
+    check_size(data)
     try:
-        return msgpack.unpackb(
-            data,
-            object_hook=take_map,
-            list_hook=take_list,
-            max_str_len=MOST_TEXT,
-            max_array_len=MOST_OBJECTS,
-            max_map_len=MOST_OBJECTS,
-            max_ext_len=0,
-        )
+        return msgpack.unpackb(data, object_hook=_decode, max_str_len=MOST_TEXT, max_ext_len=0)
     except UserError:
         raise
     except Exception as error:  # msgpack raises many kinds of exception
         raise UserError(
-            f"This is not a msgpack message that is read here ({type(error).__name__}: {error})."
+            f"This is not a msgpack message ({type(error).__name__}: {error})."
         ) from error
+
+
+def _sizes() -> tuple[tuple[int, int, int], ...]:
+    """For each first byte of a value: bytes it takes at least, width of the length after it, values
+    it announces.
+
+    Where there is a width, the number written there counts bytes (values announced: 0) or entries
+    of so many values.
+    """
+    sizes = [(1, 0, 0)] * 256
+    for kind in range(16):
+        sizes[0x80 + kind] = (1, 0, 2 * kind)
+        sizes[0x90 + kind] = (1, 0, kind)
+    for length in range(32):
+        sizes[0xA0 + length] = (1 + length, 0, 0)
+    # Bytes, extensions (which carry a type as well) and texts.
+    for step, width in enumerate((1, 2, 4)):
+        sizes[0xC4 + step] = (1 + width, width, 0)
+        sizes[0xC7 + step] = (2 + width, width, 0)
+        sizes[0xD9 + step] = (1 + width, width, 0)
+    # Lists, and maps of two values an entry.
+    for step, width in enumerate((2, 4)):
+        sizes[0xDC + step] = (1 + width, width, 1)
+        sizes[0xDE + step] = (1 + width, width, 2)
+    # Floats, unsigned and signed integers, extensions of a fixed size.
+    numbers = (4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 2, 3, 5, 9, 17)
+    for kind, size in enumerate(numbers, start=0xCA):
+        sizes[kind] = (1 + size, 0, 0)
+    return tuple(sizes)
+
+
+_SIZES = _sizes()
+
+
+def check_size(data: bytes | bytearray | memoryview, most: int = MOST_OBJECTS) -> None:
+    """Count the values of a message without making any: an empty map takes one byte here and 64 in
+    memory.
+
+    A message that is cut short or malformed passes; `unpack` says what is wrong with it.
+    """
+    at = 0  # of the next value's first byte
+    waiting = announced = 1  # values that are not read yet, and all so far
+    while waiting and at < len(data):
+        waiting -= 1
+        taken, width, more = _SIZES[data[at]]
+        if width:
+            number = int.from_bytes(data[at + 1 : at + 1 + width], "big")
+            if more:
+                more *= number
+            else:
+                taken += number
+        if more:
+            waiting += more
+            announced += more
+            if announced > most:
+                raise UserError(
+                    f"The message holds more than {most} values; a frame takes about 130. Send"
+                    " fewer."
+                )
+        at += taken
 
 
 def encode(value: Any) -> dict[bytes, Any]:

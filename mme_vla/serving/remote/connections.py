@@ -23,7 +23,7 @@ from mme_vla.serving.client import (
     key_header,
     open_socket,
 )
-from mme_vla.serving.codec import encode, msgpack, pack, read_array, unpack
+from mme_vla.serving.codec import MOST_TEXT, check_size, encode, msgpack, pack, read_array
 
 PAUSE_S = 0.5  # between two attempts to open a connection
 STARTUP_S = 2.0  # in which a server that sends its metadata first has sent them
@@ -255,8 +255,9 @@ def _decoded(data: Any) -> dict[str, Any]:
         return fields
 
     try:
-        message = unpack(data, array)
-    except UserError as error:
+        check_size(data)
+        message = msgpack.unpackb(data, object_hook=array, max_str_len=MOST_TEXT, max_ext_len=0)
+    except Exception as error:  # msgpack raises many kinds of exception
         raise UserError(f"The server's reply is malformed: {error}") from error
     if not isinstance(message, dict):
         raise UserError(f"The server's reply is malformed: {brief(message)} is no map.")
