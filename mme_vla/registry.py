@@ -8,6 +8,7 @@ import importlib
 import inspect
 import pkgutil
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -226,22 +227,21 @@ class Registry[T]:
         def decorate(entry: Any) -> Any:
             taken = self._entries.get(name)
             module = self._module_of(name)
+            mine = str(getattr(entry, "__module__", None))
             if taken is None:
                 holder = f"is taken by {module}"
                 if name in self._core:
                     holder = f"ships with the library ({module})"
-                mine = getattr(entry, "__module__", None)
-                require(
-                    module in (None, mine),
-                    f"{self.kind} {name!r} {holder}; choose another name in {mine}.",
-                )
+                is_known = module in (None, mine)
             else:
+                holder = f"is already registered by {taken!r}"
                 # A module imported twice (once as __main__) registers an equal twin.
-                require(
-                    getattr(taken, "__qualname__", None) == getattr(entry, "__qualname__", None),
-                    f"{self.kind} {name!r} is already registered by {taken!r}; choose another"
-                    " name.",
-                )
+                names = [getattr(one, "__qualname__", None) for one in (taken, entry)]
+                modules = [str(getattr(taken, "__module__", None)), mine]
+                files = [getattr(sys.modules.get(one), "__file__", one) for one in modules]
+                is_same = files[0] == files[1] or "__main__" in modules
+                is_known = names[0] == names[1] and is_same
+            require(is_known, f"{self.kind} {name!r} {holder}; choose another name in {mine}.")
             self._entries[name] = entry
             return entry
 
