@@ -96,6 +96,13 @@ def test_a_checkpoint_that_names_a_part_of_a_package_needs_trust(package: Path) 
     import_trusted(config, "a checkpoint", trust=True)
 
 
+def test_every_part_of_a_name_needs_trust(install: Callable[..., None]) -> None:
+    """`json` is imported already, so that only the other module is foreign."""
+    install(Extension(parts={"policy": {"mine": "first.policy"}, "processor": {"mine": "json"}}))
+    with pytest.raises(UserError, match=r"needs the plugin first\.policy: code"):
+        import_trusted({"policy": {"name": "mine"}}, "a checkpoint", trust=False)
+
+
 def test_an_entry_point_that_is_no_extension_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     class Entry:
         name, value = "broken", "broken_package:EXTENSION"
