@@ -207,7 +207,7 @@ class Rollout:
             message = running.report.error
         else:
             status = "error"
-            message = reply.info["error_message"]
+            message = reply.info.error
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
         self._failures.note_end(reply, message, is_repeated=self._tries[running.job] > 1)
