@@ -275,6 +275,11 @@ def aggregate(
     included = inside
     if protocol.errors == "missing":
         included = [r for r in inside if r.outcome != "error"]
+    require(
+        included or not inside,
+        f"All {len(inside)} episodes ended in an error, and errors=missing counts them as not run."
+        " The same evaluation command tries them again.",
+    )
     there = Protocol.of_records(selected)
     listed = []
     for task in there.tasks:
