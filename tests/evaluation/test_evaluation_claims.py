@@ -250,7 +250,7 @@ def test_an_episode_that_is_tried_again_comes_last() -> None:
 
 def test_nothing_is_said_of_equal_runs_that_end_alike() -> None:
     protocol = Protocol(("BinFill",), 2)
-    twice = [record(0), record(1), record(0), record(1)]
+    twice = [record(0), record(1), record(0, 2), record(1, 2)]
     other = [EpisodeRecord("else", 1, 7, "BinFill", i, 1, "easy", "fail", 5) for i in range(2)]
     results = aggregate([*twice, *other], protocol, conflicts="first")
     method = results.method("tiny")
@@ -262,7 +262,8 @@ def test_nothing_is_said_of_equal_runs_that_end_alike() -> None:
 def test_episodes_that_end_otherwise_between_equal_runs_are_counted() -> None:
     protocol = Protocol(("BinFill",), 4)
     once = [record(i) for i in range(4)]
-    twice = [*once, record(0), record(1, outcome="fail"), record(2, outcome="error")]
+    twice = [*once, record(0, 2), record(1, outcome="fail"), record(2, outcome="error")]
+    twice += once  # a copy of the file, as of a second machine, repeats nothing
     other = [EpisodeRecord("else", 1, 7, "BinFill", i, 1, "easy", "fail", 5) for i in range(4)]
     results = aggregate([*twice, *other], protocol, conflicts="first")
     method = results.method("tiny")
