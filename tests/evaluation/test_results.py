@@ -538,6 +538,8 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     ("arguments", "message"),
     [([], "Name files or folders"), (["nowhere"], "does not exist"),
      (["--demo", "--samples", "20", "--compare", "pi05", "pi06"], "pi06"),
+     (["--demo", "--samples", "0"], "samples=0 of the bootstrap must be at least 1"),
+     (["--demo", "--seed", "-1"], "seed=-1 at least 0"),
      (["--demo", "--tasks", "Binfill"], "Did you mean 'BinFill'")],
 )  # fmt: skip
 def test_mistakes_end_with_a_sentence(
