@@ -18,20 +18,18 @@ def main() -> None:
     if name in ("-V", "--version"):
         print(f"mme-vla {mme_vla.__version__}")
         return
-    if name in ("-h", "--help"):
-        width = max(map(len, commands()))
-        lines = "\n".join(
-            f"  {name:<{width}}  {command.text}" for name, command in commands().items()
-        )
-        with print_user_errors():
+    with print_user_errors():
+        known = commands()
+        if name in ("-h", "--help"):
+            width = max(map(len, known))
+            lines = "\n".join(f"  {name:<{width}}  {of.text}" for name, of in known.items())
             print(
                 f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more"
                 " of one; mme-vla --version names the version."
             )
-        return
-    if name not in commands():
-        with print_user_errors():
-            raise UserError(f"There is no command {name!r}. {did_you_mean(name, commands())}")
+            return
+        if name not in known:
+            raise UserError(f"There is no command {name!r}. {did_you_mean(name, known)}")
     sys.argv = [f"mme-vla {name}", *words]
     run(name)
 

@@ -8,8 +8,9 @@ import importlib
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -95,6 +96,7 @@ class Extension:
     configs: a folder of YAML files, searched after the library's (`config/composition.py`).
     checkpoints: name → folder.
     weight_formats: name → format that `weights` reads and writes.
+    owner: which package or extra this is, for messages; set where extensions are listed.
     """
 
     parts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -102,6 +104,30 @@ class Extension:
     configs: Path | None = None
     checkpoints: Mapping[str, Path] = field(default_factory=dict)
     weight_formats: Mapping[str, WeightFormat] = field(default_factory=dict)
+    owner: str = ""
+
+
+def join_names[T](
+    what: str, core: Mapping[str, T], brought: Iterable[tuple[Extension, Mapping[str, T]]]
+) -> dict[str, T]:
+    """The core's entries of one kind, then those that extensions bring.
+
+    Raises:
+        UserError: two of them bring different entries under one name.
+    """
+    joined = dict(core)
+    owners = dict.fromkeys(core, "the library")
+    for extension, entries in brought:
+        for name, entry in entries.items():
+            taken = joined.setdefault(name, entry)
+            owner = owners.setdefault(name, extension.owner)
+            first, second = (getattr(one, "module", one) for one in (taken, entry))
+            require(
+                taken == entry,
+                f"Two bring the {what} {name!r}: {owner} ({first}), and {extension.owner}"
+                f" ({second}). Rename it in one of them, or uninstall one.",
+            )
+    return joined
 
 
 @cache
@@ -109,8 +135,11 @@ def extras() -> tuple[Extension, ...]:
     """The extensions of `mme_vla.extras`: each folder in it has `extension.py` with `EXTENSION`."""
     package = importlib.import_module("mme_vla.extras")
     names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
-    modules = [importlib.import_module(f"{package.__name__}.{name}.extension") for name in names]
-    return tuple(module.EXTENSION for module in modules)
+    listed = []
+    for name in names:
+        module = importlib.import_module(f"{package.__name__}.{name}.extension")
+        listed.append(replace(module.EXTENSION, owner=f"the extra {name!r}"))
+    return tuple(listed)
 
 
 @cache
@@ -118,23 +147,25 @@ def installed_extensions() -> tuple[Extension, ...]:
     """The extensions of installed packages, which name theirs under `mme_vla.plugins`.
 
     Raises:
-        UserError: a package's entry point cannot be imported, or is no `Extension`.
+        UserError: a package's entry point cannot be imported, or is no `Extension`; or it brings a
+            part of no known kind, or under a name that is taken.
     """
     listed: list[Extension] = []
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
+        plugin = f"installed plugin {entry.name!r} ({entry.value})"
         try:
             extension = entry.load()
         except Exception as error:  # any error of a third-party package
             raise UserError(
-                f"The installed plugin {entry.name!r} ({entry.value}) cannot be imported:"
-                f" {type(error).__name__}: {error}. Mend or uninstall it."
+                f"The {plugin} cannot be imported: {type(error).__name__}: {error}. Mend or"
+                " uninstall it."
             ) from error
-        require(
-            isinstance(extension, Extension),
-            f"The installed plugin {entry.name!r} ({entry.value}) is no"
-            " mme_vla.registry.Extension.",
-        )
-        listed.append(extension)
+        require(isinstance(extension, Extension), f"The {plugin} is no mme_vla.registry.Extension.")
+        for key in extension.parts:
+            check_choice(f"{plugin}: kind of part", key, REGISTRIES)
+        listed.append(replace(extension, owner=f"the {plugin}"))
+    for registry in REGISTRIES.values():
+        registry.join([*extras(), *listed])
     return tuple(listed)
 
 
@@ -176,17 +207,23 @@ class Registry[T]:
         self._entries: dict[str, T] = {}
         self._core = dict(core or {})
 
-    @property
-    def _modules(self) -> dict[str, str]:
-        """Name → module: the library's own, its extras', and those of installed packages."""
-        modules = dict(self._core)
+    def join(self, listed: Iterable[Extension]) -> dict[str, str]:
+        """Name → module: the library's own, and those of extensions.
+
+        Raises:
+            UserError: two of them bring one name.
+        """
         # All keys that mean this registry, such as `event` and `intervention` of perturbations.
         keys = {self.key, *(key for key, registry in REGISTRIES.items() if registry is self)}
-        for extension in extensions():
+        brought = []
+        for extension in listed:
             for key in sorted(keys):
-                for name, module in extension.parts.get(key, {}).items():
-                    modules.setdefault(name, module)
-        return modules
+                brought.append((extension, extension.parts.get(key, {})))
+        return join_names(self.kind, self._core, brought)
+
+    @property
+    def _modules(self) -> dict[str, str]:
+        return self.join(extensions())
 
     def _module_of(self, name: str) -> str | None:
         """The module that registers a name; extensions are listed only for names the core lacks."""
@@ -198,21 +235,21 @@ class Registry[T]:
         def decorate(entry: Any) -> Any:
             taken = self._entries.get(name)
             module = self._module_of(name)
+            mine = str(getattr(entry, "__module__", None))
             if taken is None:
                 holder = f"is taken by {module}"
                 if name in self._core:
                     holder = f"ships with the library ({module})"
-                require(
-                    module in (None, getattr(entry, "__module__", None)),
-                    f"{self.kind} {name!r} {holder}; choose another name.",
-                )
+                is_known = module in (None, mine)
             else:
+                holder = f"is already registered by {taken!r}"
                 # A module imported twice (once as __main__) registers an equal twin.
-                require(
-                    getattr(taken, "__qualname__", None) == getattr(entry, "__qualname__", None),
-                    f"{self.kind} {name!r} is already registered by {taken!r}; choose another"
-                    " name.",
-                )
+                names = [getattr(one, "__qualname__", None) for one in (taken, entry)]
+                modules = [str(getattr(taken, "__module__", None)), mine]
+                files = [getattr(sys.modules.get(one), "__file__", one) for one in modules]
+                is_same = files[0] == files[1] or "__main__" in modules
+                is_known = names[0] == names[1] and is_same
+            require(is_known, f"{self.kind} {name!r} {holder}; choose another name in {mine}.")
             self._entries[name] = entry
             return entry
 

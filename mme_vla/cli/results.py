@@ -144,6 +144,17 @@ def run(args: argparse.Namespace) -> None:
     if args.episodes is not None:
         check_episodes(read_episodes(args.episodes), "--episodes")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
+    silent = []
+    for path in args.runs:
+        # A shard may have ended no episode; a folder is of a whole run.
+        is_silent = path.is_dir() and not any(f.stat().st_size for f in find_records([path]))
+        if is_silent or not records:
+            silent.append(str(path))
+    require(
+        not silent,
+        f"{', '.join(silent)}: no episode has ended there yet, so there is nothing to show. Leave"
+        " it out, or continue its evaluation.",
+    )
     protocol = _protocol(records, args)
     if args.title is None:
         is_benchmark = any(task in TASK_FACTS for task in protocol.tasks)

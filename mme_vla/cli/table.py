@@ -1,6 +1,6 @@
 """The commands by name: their modules, and what help says of them."""
 
-from mme_vla.registry import Command, extensions
+from mme_vla.registry import Command, extensions, join_names
 
 COMMANDS = {
     "train": Command(
@@ -84,11 +84,6 @@ COMMANDS = {
 
 
 def commands() -> dict[str, Command]:
-    """All commands: the core's, its extras', and those of installed packages, in this order. The
-    first one keeps a name.
-    """
-    all_commands = dict(COMMANDS)
-    for extension in extensions():
-        for name, command in extension.commands.items():
-            all_commands.setdefault(name, command)
-    return all_commands
+    """All commands: the core's, its extras', and those of installed packages, in this order."""
+    brought = [(extension, extension.commands) for extension in extensions()]
+    return join_names("command", COMMANDS, brought)

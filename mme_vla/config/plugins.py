@@ -77,15 +77,15 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
     names = plugins_of(config, source)
     # Parts of installed packages are imported when they are built. Every text of the configuration
     # may name one, wherever it is: the kind of a part is known only then.
-    module_of: dict[str, str] = {}
+    modules_of: dict[str, list[str]] = {}  # a policy and its processor may have one name
     for extension in installed_extensions():
         for parts in extension.parts.values():
-            module_of.update(parts)
+            for name, module in parts.items():
+                modules_of.setdefault(name, []).append(module)
     required = dict.fromkeys(names)  # in order, each once
-    if module_of:
+    if modules_of:
         for text in _texts(config):
-            if text in module_of:
-                required[module_of[text]] = None
+            required |= dict.fromkeys(modules_of.get(text, ()))
     strange = [name for name in required if name not in sys.modules]
     require(
         not strange or trust,

@@ -3,7 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from mme_vla.registry import extensions
+from mme_vla.errors import require
+from mme_vla.registry import extras, installed_extensions
 
 
 def config_dir() -> Path:
@@ -18,12 +19,30 @@ def config_dir() -> Path:
 def library_trees() -> tuple[Path, ...]:
     """Return the folders in the order of search: the core's, those of extras, then those of
     installed packages.
+
+    Raises:
+        UserError: the folder of a package does not exist, or a file in it has the name of another.
     """
-    folders = [config_dir()]
-    for extension in extensions():
+    owners = {config_dir(): "the library"}
+    for extension in extras():
         if extension.configs is not None:
-            folders.append(extension.configs)
-    return tuple(folders)
+            owners[extension.configs] = extension.owner
+    for extension in installed_extensions():
+        own = extension.configs
+        if own is None or own in owners:
+            continue
+        require(own.is_dir(), f"{extension.owner} has no folder {own}: install it with its files.")
+        for file in sorted(own.rglob("*.yaml")):
+            for folder, owner in owners.items():
+                name = file.relative_to(own)
+                require(
+                    not (folder / name).exists(),
+                    f"Two bring the configuration {str(name)!r}: {owner} ({folder / name}), and"
+                    f" {extension.owner} ({file}). Rename the file in one of them, or uninstall"
+                    " one.",
+                )
+        owners[own] = extension.owner
+    return tuple(owners)
 
 
 def yaml_files(trees: Iterable[Path], group: str) -> dict[str, Path]:

@@ -19,7 +19,13 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, brief
-from mme_vla.evaluation.records import EpisodeRecord, count_outcomes, read_records
+from mme_vla.evaluation.records import (
+    EpisodeRecord,
+    complete_compositions,
+    count_outcomes,
+    merge,
+    read_records,
+)
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.store import RUN_FILE, read_run
 from mme_vla.policy.base import Policy
@@ -271,7 +277,8 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
             for key, value in to_json(_score(file, records, content["settings"])).items():
                 if key == "scenes" and key not in content:
                     result.not_compared.append("scenes: the receipt does not name them.")
-                else:
+                elif key != "score" or content["score"] != _outcomes(records):
+                    # Receipts of earlier versions count every try of an episode.
                     result.compare(key, content.get(key, {}), value)
             _compare_records(result, records, content)
             _compare_scenes(result, records, content, build)
@@ -287,8 +294,9 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
 def _score(
     path: Path, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Outcomes of each task, and digests: of the file of records, uncompressed, of the choice of
-    scenes (a file of scenes counts with its content) and of every scene that was built.
+    """Outcomes of each task, of each episode the one that results count, and digests: of the file
+    of records, uncompressed, of the choice of scenes (a file of scenes counts with its content) and
+    of every scene that was built.
     """
     digest_of_file = None
     if path.exists():
@@ -298,19 +306,24 @@ def _score(
         split = file_sum(Path(split))
     seeds: dict[str, list[Any]] = {}
     scenes: dict[str, str] = {}
-    tasks: dict[str, list[EpisodeRecord]] = {}
     for record in records:
         name = f"{record.task} {record.episode}"
         seeds[name] = [record.seed, record.difficulty]
-        tasks.setdefault(record.task, []).append(record)
         if record.scene:
             scenes[name] = record.scene
     return {
         "records": {"file": path.name.removesuffix(".xz"), "sha256": digest_of_file},
         "scenes": digest({"split": split, "scenes": seeds}, 64),
         "scene_digests": scenes,
-        "score": {task: count_outcomes(members) for task, members in tasks.items()},
+        "score": _outcomes(merge(complete_compositions(records), "first")),
     }
+
+
+def _outcomes(records: Sequence[EpisodeRecord]) -> dict[str, Mapping[str, int]]:
+    tasks: dict[str, list[EpisodeRecord]] = {}
+    for record in records:
+        tasks.setdefault(record.task, []).append(record)
+    return {task: count_outcomes(members) for task, members in tasks.items()}
 
 
 def _compare_records(
@@ -367,6 +380,8 @@ def _compare_scenes(
         result.not_compared.append("scenes: there is no record.")
     try:
         env = environment(str(content["settings"].get("env")))
+        # A try that ended before its scene was built does not count beside one that names it.
+        named = {record.key for record in records if record.named_scene is not None}
         for record in records:
             env.check_task(record.task)
             spec = env.episode(record.task, record.split, record.episode)
@@ -374,7 +389,8 @@ def _compare_scenes(
             then = f"{record.seed}, {record.difficulty}"
             result.compare(name, then, f"{spec.seed}, {spec.difficulty}")
             if record.scene in _UNNAMED_SCENES:
-                result.not_compared.append(_UNNAMED_SCENES[record.scene])
+                if record.key not in named:
+                    result.not_compared.append(_UNNAMED_SCENES[record.scene])
             elif build:
                 result.compare(name, record.scene, env.scene_digest(spec))
             else:

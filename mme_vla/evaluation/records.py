@@ -394,7 +394,8 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             f" {old.outcome} at {old.when}, {new.outcome} at {new.when}. Name one of the runs, or"
             " choose conflicts first or last.",
         )
-        supersedes = new.when > old.when if conflicts == "last" else new.when < old.when
+        # Of records of one second the later in the list is the last.
+        supersedes = new.when >= old.when if conflicts == "last" else new.when < old.when
         if supersedes:
             merged[at] = new
     return list(merged.values())

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import UserError, require
-from mme_vla.registry import extensions
+from mme_vla.registry import extensions, join_names
 
 OUTPUTS = "outputs"
 """The folder of the current one in which commands write."""
@@ -106,10 +106,8 @@ def check_output(place: str | Path) -> None:
 
 def shipped_checkpoints() -> dict[str, Path]:
     """The checkpoints that extras and installed packages bring along: name → folder."""
-    by_name: dict[str, Path] = {}
-    for extension in extensions():
-        by_name.update(extension.checkpoints)
-    return by_name
+    brought = [(extension, extension.checkpoints) for extension in extensions()]
+    return join_names("checkpoint", {}, brought)
 
 
 def shipped_name(folder: Path) -> str | None:

@@ -530,7 +530,8 @@ class Places:
         for address in transports:
             self._deadlines.setdefault(address, now + BRIEF_S)
         pending = [(end, address) for address, end in self._deadlines.items() if end is not None]
-        pending.sort(reverse=True)
+        # Addresses are not compared: that of a client that left at once is None.
+        pending.sort(key=lambda entry: entry[0], reverse=True)
         for number, (end, address) in enumerate(pending):
             if end < now or number >= MAX_IDLE_CONNECTIONS:
                 transports[address].abort()

@@ -189,8 +189,10 @@ def require_replaceable(path: Path, *suffixes: str) -> Path:
         suffixes: how names of such files end, such as `.html`.
 
     Raises:
-        UserError: a file is there whose name ends otherwise.
+        UserError: a folder is there, or a file whose name ends otherwise.
     """
+    example = path / f"NAME{suffixes[0]}"
+    require(not path.is_dir(), f"{path} is a folder: name a file, such as {example}.")
     require(
         not path.is_file() or path.suffix.lower() in suffixes,
         f"{path} exists, and its name does not end with {' or '.join(suffixes)}: it is not"

@@ -11,7 +11,7 @@ from torch import Tensor
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
-from mme_vla.registry import WeightFormat, extensions
+from mme_vla.registry import WeightFormat, extensions, join_names
 from mme_vla.utils import decoding, require_file
 from mme_vla.weights.names.jax_memory import ENCODER
 from mme_vla.weights.orbax import (
@@ -37,10 +37,9 @@ FORMATS = {
 
 def method_formats() -> dict[str, WeightFormat]:
     """The formats that extensions add, by name."""
-    by_name: dict[str, WeightFormat] = {}
-    for extension in extensions():
-        by_name.update(extension.weight_formats)
-    return by_name
+    brought = [(extension, extension.weight_formats) for extension in extensions()]
+    by_name: dict[str, Any] = join_names("weight format", FORMATS, brought)
+    return {name: entry for name, entry in by_name.items() if name not in FORMATS}
 
 
 def formats() -> dict[str, str]:

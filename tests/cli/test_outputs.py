@@ -124,6 +124,8 @@ def test_an_earlier_output_and_a_device_are_written_again(tmp_path: Path) -> Non
     assert require_replaceable(tmp_path / "page.HTML", ".html") == tmp_path / "page.HTML"
     assert require_replaceable(tmp_path / "new", ".html") == tmp_path / "new"
     assert require_replaceable(Path("/dev/null"), ".html") == Path("/dev/null")
+    with pytest.raises(UserError, match=r"is a folder: name a file, such as .*/NAME\.html\."):
+        require_replaceable(tmp_path, ".html", ".htm")
 
 
 def test_an_analysis_replaces_neither_other_files_nor_one_beside_its_output(tmp_path: Path) -> None:

@@ -1,7 +1,10 @@
 """Tables of parts: names that ship with the library are not taken by others."""
 
+import importlib
+import runpy
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -26,6 +29,23 @@ def test_a_name_that_ships_is_not_taken_before_it_is_used() -> None:
 def test_a_name_is_taken_once() -> None:
     with pytest.raises(UserError, match=r"ships with the library|already registered"):
         register("memory", "tokendrop")(type("Mine", (), {}))
+
+
+def test_a_class_of_the_same_name_in_another_module_takes_no_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = (
+        "from mme_vla import register\n@register('reward', 'of_mine')\nclass Mine: 'one of two'\n"
+    )
+    for name in ("first_rewards", "second_rewards"):
+        (tmp_path / f"{name}.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(REGISTRIES["reward"], "_entries", {})
+    first = importlib.import_module("first_rewards")
+    with pytest.raises(UserError, match=r"<class 'first_rewards\.Mine'>; .* in second_rewards\."):
+        importlib.import_module("second_rewards")
+    importlib.reload(first)
+    runpy.run_path(str(tmp_path / "first_rewards.py"), run_name="__main__")
 
 
 class Base:

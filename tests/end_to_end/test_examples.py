@@ -3,6 +3,7 @@ folder.
 """
 
 import re
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,16 +137,14 @@ def test_an_example_works_in_its_commands(row: Row, tmp_path: Path) -> None:
         run(tmp_path, row, "probe", *trained, *PROBE, f"with={row.arms}", "output=probed")
         assert list((tmp_path / "probed").rglob("*.json*"))
     if row.served:
-        served(tmp_path, row, *trained)
+        served(tmp_path, environment(row), "flow_steps=2", *trained)
 
 
-def served(folder: Path, row: Row, *words: str) -> None:
+def served(folder: Path, env: dict[str, str], *words: str) -> None:
     """Two chunks of a server in a process of its own."""
     image = np.zeros((256, 256, 3), np.uint8)
     with (
-        commands.serving(
-            "mme_vla.serve", *words, "flow_steps=2", cwd=folder, env=environment(row)
-        ) as port,
+        commands.serving("mme_vla.serve", *words, cwd=folder, env=env) as port,
         Client(f"ws://127.0.0.1:{port}") as client,
     ):
         client.reset()
@@ -161,3 +160,44 @@ def served(folder: Path, row: Row, *words: str) -> None:
                 }
             )["actions"]
             assert np.isfinite(chunk).all()
+
+
+# A method and a command, in a package of their own ------------------------------------------------
+
+METHOD = EXAMPLES / "one_layer"
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> str:
+    """The folders of an installed `one_layer`, as `PYTHONPATH` has them."""
+    project = tomllib.loads((METHOD / "pyproject.toml").read_text())["project"]
+    metadata = tmp_path / "site" / "one_layer-0.1.dist-info"
+    metadata.mkdir(parents=True)
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: one-layer\nVersion: 0.1\n")
+    lines = [f"[{group}]" for group in project["entry-points"]]
+    lines += [f"{k} = {v}" for k, v in project["entry-points"]["mme_vla.plugins"].items()]
+    (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return f"{REPOSITORY}:{METHOD}:{metadata.parent}"
+
+
+def test_the_shortest_method_is_short_and_the_page_shows_its_names() -> None:
+    files = sorted((METHOD / "one_layer").glob("*.py"))
+    texts = [file.read_text() for file in files]
+    assert sum(len(text.splitlines()) for text in texts) <= 70
+    page = (REPOSITORY / "docs" / "extend" / "add-a-method.md").read_text()
+    shown = (METHOD / "one_layer" / "extension.py").read_text().partition("from pathlib")[2]
+    assert f"from pathlib{shown}" in page
+    entry_point = (METHOD / "pyproject.toml").read_text().partition("[project.entry")[2]
+    assert f"[project.entry{entry_point}" in page
+
+
+@pytest.mark.slow
+def test_the_shortest_method_and_its_command_work(installed: str, tmp_path: Path) -> None:
+    env = {"PYTHONPATH": installed, "OMP_NUM_THREADS": "1"}
+    for words in (("train", "model=one_layer", *BRIEF, "output=run"), ("one-layer", "run")):
+        done = commands.run("mme_vla", *words, cwd=tmp_path, env=env)
+        assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout == "66,560 weights\n"
+    losses = [line["train/loss"] for line in read_metrics(tmp_path / "run")]
+    assert len(losses) == 2 and np.isfinite(losses).all()
+    served(tmp_path, env, "checkpoint=run", "--trust-plugins")

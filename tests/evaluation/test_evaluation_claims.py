@@ -139,6 +139,25 @@ def test_a_restarted_process_gives_back_its_unfinished_episodes(tmp_path: Path) 
         assert [taken(other.take(JOBS)) for _ in range(2)] == [1, 2]
 
 
+def test_an_episode_that_was_given_up_is_taken_again_by_a_repeated_command_alone(
+    tmp_path: Path,
+) -> None:
+    names = [f"episodes-{i}of3.jsonl" for i in range(3)]
+    with RecordLog(tmp_path / names[1]):
+        other = Claims(tmp_path, names[1])
+        with RecordLog(tmp_path / names[0]) as log:
+            first = Claims(tmp_path, names[0])
+            waiting = Waiting(JOBS[:1], first)
+            assert taken(waiting.take()) == 0
+            log.append(record(0, outcome="error"))
+            waiting.give_up(JOBS[0])
+            assert Claims(tmp_path, names[2]).take(JOBS[:1]) is None, "it began a little later"
+        assert other.take(JOBS[:1]) is None, "the first has ended, this one is alive"
+    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
+        again = [Claims(tmp_path, name) for name in names[:2]]
+        assert [taken(claims.take(JOBS[:1])) for claims in again[::-1]] == [0, None]
+
+
 def test_one_of_two_processes_takes_over_a_stale_claim(tmp_path: Path) -> None:
     with RecordLog(tmp_path / "episodes-0of3.jsonl"):
         Claims(tmp_path, "episodes-0of3.jsonl").take(JOBS[:1])
@@ -226,7 +245,7 @@ def test_an_episode_that_is_tried_again_comes_last() -> None:
 
 def test_nothing_is_said_of_equal_runs_that_end_alike() -> None:
     protocol = Protocol(("BinFill",), 2)
-    twice = [record(0), record(1), record(0), record(1)]
+    twice = [record(0), record(1), record(0, 2), record(1, 2)]
     other = [EpisodeRecord("else", 1, 7, "BinFill", i, 1, "easy", "fail", 5) for i in range(2)]
     results = aggregate([*twice, *other], protocol, conflicts="first")
     method = results.method("tiny")
@@ -238,7 +257,8 @@ def test_nothing_is_said_of_equal_runs_that_end_alike() -> None:
 def test_episodes_that_end_otherwise_between_equal_runs_are_counted() -> None:
     protocol = Protocol(("BinFill",), 4)
     once = [record(i) for i in range(4)]
-    twice = [*once, record(0), record(1, outcome="fail"), record(2, outcome="error")]
+    twice = [*once, record(0, 2), record(1, outcome="fail"), record(2, outcome="error")]
+    twice += once  # a copy of the file, as of a second machine, repeats nothing
     other = [EpisodeRecord("else", 1, 7, "BinFill", i, 1, "easy", "fail", 5) for i in range(4)]
     results = aggregate([*twice, *other], protocol, conflicts="first")
     method = results.method("tiny")

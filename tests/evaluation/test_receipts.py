@@ -19,6 +19,7 @@ from helpers.rollout_fakes import quick_policy
 from mme_vla import UserError
 from mme_vla.cli.results import main
 from mme_vla.envs.base import environment
+from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.evaluation import receipts
 from mme_vla.evaluation.records import EpisodeRecord, RecordLog
 from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
@@ -47,9 +48,16 @@ def committed_code(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(
-    folder: Path, checkpoint: Path, episodes: range = range(3), execute: int | None = None
+    folder: Path,
+    checkpoint: Path,
+    episodes: range = range(3),
+    execute: int | None = None,
+    errors: int = 0,
 ) -> Path:
-    """Records of these episodes, every second one solved, with their receipt."""
+    """Records of these episodes, every second one solved, with their receipt.
+
+    errors: tries of episode 1 before that ended in an error.
+    """
     policy = Policy.from_pretrained(checkpoint)
     settings = RolloutSettings(execute=execute)
     facts = facts_of(policy, None, str(checkpoint), settings, None)
@@ -59,9 +67,12 @@ def run(
         RecordLog(path) as log,
         receipts.receipt(path, policy, claimed, str(checkpoint), renders=False),
     ):
-        for number in episodes:
+        for index, number in enumerate((*[1] * errors, *episodes)):
             spec = environment("mme_vla").episode("VideoUnmask", "test", number)
             outcome = "success" if number % 2 else "fail"
+            scene = environment("mme_vla").scene_digest(spec)
+            if index < errors:
+                outcome, scene = "error", NOT_BUILT
             log.append(
                 EpisodeRecord(
                     facts.model,
@@ -73,7 +84,7 @@ def run(
                     spec.difficulty,
                     outcome,
                     9,
-                    scene=environment("mme_vla").scene_digest(spec),
+                    scene=scene,
                 )
             )
     return folder / "receipt.json"
@@ -97,6 +108,28 @@ def test_a_receipt_agrees_with_its_run(
     records.with_name("episodes.jsonl.xz").write_bytes(lzma.compress(records.read_bytes()))
     records.unlink()
     assert receipts.verify(path) == ([], [], []), "as records are published"
+
+
+def test_an_episode_that_was_tried_again_counts_once(checkpoint: Path, tmp_path: Path) -> None:
+    path = run(tmp_path, checkpoint, range(1, 2), errors=1)
+    counts = {"success": 1, "fail": 0, "timeout": 0, "error": 0}
+    assert receipts.read_receipt(path)["score"] == {"VideoUnmask": counts}
+    assert receipts.verify(path).word == "agrees"
+    # as earlier versions counted
+    rewrite(path, lambda content: content["score"]["VideoUnmask"].update(error=1))
+    assert receipts.verify(path).word == "agrees"
+    rewrite(path, lambda content: content["score"]["VideoUnmask"].update(error=2))
+    assert receipts.verify(path).differences == [
+        "score.VideoUnmask.error: 2 in the receipt, 0 here"
+    ]
+
+
+def test_an_episode_whose_every_try_failed_is_one_error(checkpoint: Path, tmp_path: Path) -> None:
+    path = run(tmp_path, checkpoint, range(0), errors=2)
+    counts = {"success": 0, "fail": 0, "timeout": 0, "error": 1}
+    assert receipts.read_receipt(path)["score"] == {"VideoUnmask": counts}
+    result = receipts.verify(path)
+    assert result.word == "not compared" and "ended before" in result.not_compared[0]
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "norm_stats.json"])

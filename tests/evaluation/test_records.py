@@ -169,6 +169,9 @@ def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
     for order in ([early, late], [late, early]):
         assert merge(order, "first") == [early]
         assert merge(order, "last") == [late]
+    same_second = replace(late, when=early.when)
+    assert merge([early, same_second], "last") == [same_second]
+    assert merge([early, same_second], "first") == [early]
     assert merge([early, replace(early, when=late.when)]) == [early]
     with pytest.raises(UserError, match="Did you mean 'last'"):
         merge([early], "lst")

@@ -229,6 +229,9 @@ def test_errors_are_failures_or_missing_as_requested() -> None:
     assert results.methods[0].average.mean == 87.5
     assert any("1 episode ended in an error" in note for note in results.notes)
     assert aggregate(made, replace(SMALL, errors="missing")).methods[0].average.mean is None
+    errors = [record for record in made if record.outcome == "error"]
+    with pytest.raises(UserError, match=rf"All {len(errors)} episodes ended in an error, and err"):
+        aggregate(errors, replace(SMALL, errors="missing"))
 
 
 def test_difficulties_cut_across_tasks() -> None:
@@ -533,6 +536,8 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     ("arguments", "message"),
     [([], "Name files or folders"), (["nowhere"], "does not exist"),
      (["--demo", "--samples", "20", "--compare", "pi05", "pi06"], "pi06"),
+     (["--demo", "--samples", "0"], "samples=0 of the bootstrap must be at least 1"),
+     (["--demo", "--seed", "-1"], "seed=-1 at least 0"),
      (["--demo", "--tasks", "Binfill"], "Did you mean 'BinFill'")],
 )  # fmt: skip
 def test_mistakes_end_with_a_sentence(
@@ -542,6 +547,21 @@ def test_mistakes_end_with_a_sentence(
         main(arguments)
     assert ended.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_run_without_an_ended_episode_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty" / "episodes.jsonl"
+    save_records(empty, [])
+    save_records(tmp_path / "there", [EpisodeRecord("m", 1, 7, "BinFill", 0, 0, "easy", "fail", 9)])
+    there = str(tmp_path / "there")
+    for words in ([str(empty)], [str(empty.parent)], [there, str(empty.parent)]):
+        with pytest.raises(SystemExit):
+            main([*words, "--brief"])
+        assert f"{words[-1]}: no episode has ended there yet" in capsys.readouterr().err
+    main([there, str(empty), "--brief"])  # as a shell lists the files of shards
+    assert "BinFill" in capsys.readouterr().out
 
 
 def test_two_methods_without_a_common_episode_are_listed_but_not_compared(

@@ -2,6 +2,7 @@
 
 import signal
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -17,15 +18,16 @@ from helpers.rollout_fakes import (
     save_records,
     use_inline_envs,
 )
-from helpers.scripted_env import make_mortal_env, make_moving_env
+from helpers.scripted_env import ScriptedEnv, make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import SceneError
+from mme_vla.errors import SceneError, text_of
 from mme_vla.evaluation.claims import Claims, Shard, choose_shard
-from mme_vla.evaluation.records import EpisodeRecord, RunKey
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog, RunKey
 from mme_vla.evaluation.rollout.environment import Report
 from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, default_output
 from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
@@ -82,8 +84,13 @@ def test_a_dying_worker_is_an_error_that_is_tried_again(
     policy = quick_policy("pi05")
     (tmp_path / "graves").mkdir()
     monkeypatch.setenv("GRAVES", str(tmp_path / "graves"))
+    replies: list[Reply] = []
+    monkeypatch.setattr(Rollout, "on_reply", lambda self, running, reply: replies.append(reply))
     at_once = run_evaluation(policy, tmp_path / "a", make_mortal_env, jobs=JOBS[1:3])
     records = read_records(tmp_path / "a" / "episodes.jsonl")
+    assert replies and all(isinstance(reply.info, Report) for reply in replies)
+    (lost,) = [reply for reply in replies if reply.error is not None]
+    assert lost.done and lost.info.error == "PickXtimes test episode 1: " + text_of(lost.error)
     (error,) = [record for record in records if record.outcome == "error"]
     assert error.key == ("PickXtimes", 1) and "exit code 3" in error.error and error.steps == 16
     assert len(records) == 3 and {record.outcome for record in at_once.records} == {"timeout"}
@@ -94,6 +101,27 @@ def test_a_dying_worker_is_an_error_that_is_tried_again(
     resumed = run_evaluation(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
     assert {record.outcome for record in resumed.records} == {"timeout"}
     assert outcomes(tmp_path / "b").items() <= outcomes(tmp_path / "a").items()
+
+
+@pytest.mark.parametrize("retries", [0, 2])
+def test_another_shard_does_not_take_an_episode_whose_every_try_failed(
+    retries: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_inline_envs(monkeypatch)
+    monkeypatch.setattr(
+        ScriptedEnv, "step", lambda self, action: (self._lists([self._frame()]), 0.0, True, False,
+                                                   {**self._info("error"), "error_message": "no"})
+    )  # fmt: skip
+    names = [f"episodes-{i}of2.jsonl" for i in range(2)]
+    settings = RolloutSettings(max_steps=16, workers=1, max_batch=1, retries=retries)
+    options = RunOptions(base=make_moving_env, show_progress=False, shard=Shard(0, 2))
+    with RecordLog(tmp_path / names[1]):
+        other = Claims(tmp_path, names[1])
+        EvaluationRun(quick_policy("pi05"), JOBS[:2], tmp_path, FACTS, settings, options).run()
+        tries = Counter(record.key for record in read_records(tmp_path / names[0]))
+        assert list(tries.values()) == [retries + 1] * 2
+        assert other.take(JOBS[:2]) is None
+    assert Claims(tmp_path, names[0]).take(JOBS[:2]) == JOBS[0], "the command was repeated"
 
 
 def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(
@@ -173,7 +201,8 @@ def test_a_shard_comes_from_the_word_or_from_torchrun(monkeypatch: pytest.Monkey
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
         def start(self, worker, job, **how):
-            self._replies.append(Reply.of_failure(worker, job, True, self.kind("no scene")))
+            error = self.kind("no scene")
+            self._replies.append(Reply.of_failure(worker, job, True, error, Report.of_failure))
 
     envs = Broken(2)
     envs.kind = UserError

@@ -8,7 +8,9 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -105,6 +107,23 @@ def test_headers_that_never_end_are_not_waited_for(policy, monkeypatch):
                     raw.sendall(b"G")
             time.sleep(0.1)
         assert not open_connections(served)
+
+
+def test_a_client_without_an_address_does_not_end_the_search_for_overdue_ones():
+    """Uvicorn names no address of a connection that was reset before it was taken."""
+    cut: list[Any] = []
+    connections = [
+        SimpleNamespace(client=client, transport=SimpleNamespace(abort=partial(cut.append, client)))
+        for client in (None, ("127.0.0.1", 4000), ("127.0.0.1", 4001))
+    ]
+    uvicorn: Any = SimpleNamespace(server_state=SimpleNamespace(connections=connections))
+    places = server.Places(Limits(), server.ServerStats())
+    places.end_overdue(uvicorn)  # all get the same time
+    assert not cut
+    for connection in connections:
+        places.end_request(connection.client, -1.0)
+    places.end_overdue(uvicorn)
+    assert sorted(map(str, cut)) == ["('127.0.0.1', 4000)", "('127.0.0.1', 4001)", "None"]
 
 
 def resident_mib() -> float:

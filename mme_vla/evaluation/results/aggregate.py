@@ -265,6 +265,11 @@ def aggregate(
     included = inside
     if protocol.errors == "missing":
         included = [r for r in inside if r.outcome != "error"]
+    require(
+        included or not inside,
+        f"All {len(inside)} episodes ended in an error, and errors=missing counts them as not run."
+        " The same evaluation command tries them again.",
+    )
     there = Protocol.of_records(selected)
     listed = []
     for task in there.tasks:
@@ -308,9 +313,14 @@ def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[in
     """Of each run: how many episodes ended twice or more by themselves, and how many of those not
     always alike.
 
-    An episode whose records are not of the same scene was not repeated.
+    An episode whose records are not of the same scene was not repeated, nor one whose record was
+    copied.
     """
-    table = record_table([record for record in records if record.outcome != "error"])
+    distinct: dict[str, EpisodeRecord] = {}
+    for record in records:
+        if record.outcome != "error":
+            distinct[record.to_json()] = record
+    table = record_table(list(distinct.values()))
     counts: dict[RunKey, tuple[int, int]] = {}
     for (run, _, _), members in table.groupby(["run", "task", "episode"], sort=False):
         if len(members) < 2 or not pair([{0: list(members["record"])}]).keys:

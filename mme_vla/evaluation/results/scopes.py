@@ -133,6 +133,11 @@ class Protocol:
                 0 < self.confidence < 1,
                 f"confidence={self.confidence} must lie between 0 and 1, for instance 0.95.",
             ),
+            (
+                self.samples >= 1 and self.seed >= 0,
+                f"samples={self.samples} of the bootstrap must be at least 1, and"
+                f" seed={self.seed} at least 0.",
+            ),
         ):
             require(holds, message)
 

@@ -207,7 +207,7 @@ class Rollout:
             message = running.report.error
         else:
             status = "error"
-            message = reply.info["error_message"]
+            message = reply.info.error
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
         self._failures.note_end(reply, message, is_repeated=self._tries[running.job] > 1)
@@ -305,6 +305,8 @@ class Rollout:
         self.on_end(running, Ending(outcome, error, again))
         if again:
             self._waiting.put_back(running.job)
+        elif outcome == "error":
+            self._waiting.give_up(running.job)
         del self._running[running.worker]
         self._start(running.worker)
 
