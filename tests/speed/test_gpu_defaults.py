@@ -8,6 +8,7 @@ import torch
 
 from mme_vla import MMEPolicy
 from mme_vla.extras.methods.diffusion_policy.policy import DiffusionPolicy
+from mme_vla.speed.compiler import CACHE_VARIABLE
 from mme_vla.testing.small import random_batch, small_policy
 
 
@@ -61,3 +62,21 @@ def test_the_measurement_of_a_gpu_compares_chunks_that_every_layer_changes(
                 weight.mul_(2)
         assert (sample() - chunk).abs().max() > 1e-4, type(part).__name__
         part.load_state_dict(before)
+
+
+def test_a_rehearsal_leaves_no_code_in_the_users_cache(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    gpu = importlib.import_module("gpu")
+    monkeypatch.setattr(gpu.inductor_config.test_configs, "max_mm_configs", None)
+    monkeypatch.setattr(torch.backends.cudnn, "enabled", True)
+    monkeypatch.setenv("MME_VLA_CACHE", str(tmp_path))
+    monkeypatch.setenv(CACHE_VARIABLE, "")
+    monkeypatch.delenv(CACHE_VARIABLE)
+    no_row = ("--device", "cpu", "--parts", "tuned", "--eager")
+    assert gpu.main(["--rehearse", *no_row]) == 0
+    assert not list(tmp_path.iterdir())
+    monkeypatch.delenv(CACHE_VARIABLE)
+    gpu.main(no_row)
+    assert [folder.name for folder in tmp_path.iterdir()] == ["compiled"]
