@@ -197,8 +197,8 @@ class WeightUpdate:
     """Clips the gradients, moves the weights, and their average towards them.
 
     Clipping, AdamW and averaging are three passes over the weights, some 52 bytes a parameter with
-    the norm. With `one_pass` they are one compiled pass of 40 bytes, with fewer launches. It rounds
-    differently.
+    the norm. With `one_pass` they are one compiled pass of 40 bytes, a launch for each weight. It
+    rounds differently.
     """
 
     def __init__(
