@@ -172,8 +172,7 @@ class MemoryModule(nn.Module):
             features,
             send(positions, device),
             torch.ones(len(indices), dtype=torch.bool, device=device),
-            # Filled in there: a copy would wait for all that the device was asked to do before.
-            torch.full((), int(history.times(np.array(step))), device=device),
+            torch.full((), int(history.times(np.array(step))), device=device),  # no copy waits
         )
         return pad_selection(selection, padded_length(self, len(indices)), bool(self.pad_left))
 
