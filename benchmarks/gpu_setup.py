@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from mme_vla import MMEPolicy, build_policy
 from mme_vla.extras.probing.analyses.cost import flops
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.speed import HasAttentionBackends
+from mme_vla.testing.small import open_gates
 from mme_vla.types import Batch
 
 PEAKS = {
@@ -25,7 +27,7 @@ PEAKS = {
     "GH200": 989,
     "B200": 2250,
     "A100": 312,
-    "A40": 150,
+    "NVIDIA A40": 150,  # no RTX A4000
     "L40S": 362,
     "RTX 4090": 165,
     "RTX 3090": 71,
@@ -115,6 +117,7 @@ def wait(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
+@cache
 def sample_flops(model: str, backbone: str) -> tuple[int, int]:
     """FLOPs of a sample's forward and backward pass with a frozen tower, counted on the meta
     device.
@@ -135,7 +138,9 @@ def sample_flops(model: str, backbone: str) -> tuple[int, int]:
 
 
 def built(model: str, backbone: str, device: torch.device, attention: str = "auto") -> MMEPolicy:
-    """A policy as it is trained, its tower frozen; or `OPENPI`, with all weights trained."""
+    """A policy as it is trained, its tower frozen; or `OPENPI`, with all weights trained. Its gates
+    are open: with those of fresh weights, which are shut, no layer reaches a chunk.
+    """
     # PaliGemma's tokenizer is gated, and no text is measured.
     options: dict[str, Any] = {"policy.augment": False, "processor.tokenizer": "sample"}
     as_openpi = model == OPENPI
@@ -145,6 +150,7 @@ def built(model: str, backbone: str, device: torch.device, attention: str = "aut
         options["policy.compute_dtype"] = "bfloat16"
     policy = build_policy(model, backbone=backbone, device=device, **options)
     assert isinstance(policy, MMEPolicy)
+    open_gates(policy)
     backbone_module = policy.backbone
     assert isinstance(backbone_module, HasAttentionBackends)
     backbone_module.set_attention_backend(attention)
@@ -153,12 +159,21 @@ def built(model: str, backbone: str, device: torch.device, attention: str = "aut
 
 
 def batch_of(policy: MMEPolicy, size: int, device: torch.device) -> Batch:
-    """A full batch whose prompts have some padding, as they do in training."""
+    """A full batch of random content, whose prompts have some padding, as they do in training."""
     full = policy.full_batch(device)
     batch = full.rows(torch.zeros(size, dtype=torch.int64, device=device))
     mask = batch.prompt_mask.clone()
     mask[:, -3:] = False
-    return replace(batch, prompt_mask=mask)
+    history = batch.history
+    if history is not None:
+        history = replace(history, features=torch.randn_like(history.features))
+    return replace(
+        batch,
+        images=torch.randint_like(batch.images, 256),
+        prompt=torch.randint_like(batch.prompt, 2, 200),
+        prompt_mask=mask,
+        history=history,
+    )
 
 
 def draws_of(policy: MMEPolicy, size: int, device: torch.device) -> dict[str, Tensor]:

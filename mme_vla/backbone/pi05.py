@@ -286,8 +286,11 @@ class Pi05Backbone(
         reports what would fall back to eager. `options` are `torch.compile`'s and override these.
         """
         # Layers share one code: each passes it in training, prefill and denoising, with and without
-        # gradients.
-        torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
+        # gradients. Where lengths are no symbols it is compiled for every length of prompt and size
+        # of batch, and beyond the limit `fullgraph` raises an error.
+        limit = 64 if options.get("dynamic", True) else 1024
+        for name in ("recompile_limit", "accumulated_recompile_limit"):
+            setattr(torch._dynamo.config, name, max(getattr(torch._dynamo.config, name), limit))
         for module in (self.vision, *self.transformer.layers):
             module.compile(**{"fullgraph": True, "dynamic": True, **options})
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import brief, check_choice, require
 from mme_vla.memory.history import FrameScorer, History, StorageSpec
-from mme_vla.types import HistoryTokens, Labels, MemoryTokens
+from mme_vla.types import HistoryTokens, Labels, MemoryTokens, send
 
 POSITION_GRID = 16
 """Rows and columns of token positions are in sixteenths of a view's side, as released, whatever its
@@ -185,9 +185,9 @@ class MemoryModule(nn.Module):
         positions = torch.from_numpy(token_positions(history.timed(indices), self.storage.grid))
         selection = HistoryTokens(
             features,
-            positions.to(device),
+            send(positions, device),
             torch.ones(len(indices), dtype=torch.bool, device=device),
-            torch.tensor(int(history.times(np.array(step))), device=device),
+            torch.full((), int(history.times(np.array(step))), device=device),  # no copy waits
         )
         return pad_selection(selection, padded_length(self, len(indices)), bool(self.pad_left))
 

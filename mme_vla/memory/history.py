@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, check_choice, check_sizes, require
-from mme_vla.types import FrameBatch
+from mme_vla.types import FrameBatch, send
 
 
 def on_interval[T: (int, np.ndarray)](frames: T, every: int) -> T:
@@ -396,9 +396,9 @@ class OnlineHistory(History):
         if self._tokens is None:
             raise UserError("The history is empty: observe at least one frame before acting.")
         device = self._tokens.device
-        rows = torch.as_tensor(self._row_of(indices[:, 0], self.stored_frames), device=device)
-        patches = torch.as_tensor(indices[:, 1], device=device)
-        return self._tokens[rows, patches]
+        rows = torch.from_numpy(self._row_of(indices[:, 0], self.stored_frames))
+        patches = torch.from_numpy(indices[:, 1])
+        return self._tokens[send(rows, device), send(patches, device)]
 
 
 class DerivedHistory(History):
@@ -518,6 +518,5 @@ class LazyHistory(OnlineHistory):
                 del self._waiting[frame]
         encoded = torch.stack([self._encoded[frame] for frame in frames])
         device = encoded.device
-        return encoded[
-            torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)
-        ]
+        patches = torch.from_numpy(indices[:, 1])
+        return encoded[send(torch.from_numpy(rows), device), send(patches, device)]

@@ -27,7 +27,7 @@ from mme_vla.memory.base import (
     token_positions,
 )
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, MemoryTokens, send
 
 
 def recurrent_frames(
@@ -498,7 +498,7 @@ class RecurrentMemory(ScheduledMemory):
         x = torch.stack(features)
         mask = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
         state = self.update(
-            _stack(states), x, torch.from_numpy(np.stack(positions)).to(x.device), mask
+            _stack(states), x, send(torch.from_numpy(np.stack(positions)), x.device), mask
         )
         for i, (_, snapshot, frames) in enumerate(group):
             snapshot.state = tuple(tensor[i : i + 1] for tensor in state)

@@ -426,7 +426,8 @@ def choose_actions(
     batch = policy.observation(episodes)
     noise = stack_noise([episode.draw() for episode in episodes])
     was_training = policy.training
-    policy.eval()
+    if was_training:  # it goes through a thousand modules, which takes milliseconds
+        policy.eval()
     try:
         if sample_chunk is None:
             chunk = policy.predict_chunk(batch, episodes, noise, steps)
@@ -434,7 +435,8 @@ def choose_actions(
             chunk = sample_chunk(batch, noise)
         chunk = chunk.float().cpu()
     finally:
-        policy.train(was_training)
+        if was_training:
+            policy.train()
     actions = executable_actions(policy, chunk, episodes)
     for episode, executed in zip(episodes, actions, strict=True):
         episode.acted(executed)

@@ -45,7 +45,7 @@ from mme_vla.processing.prompt import (
 )
 from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
 from mme_vla.registry import PROCESSORS
-from mme_vla.types import Batch
+from mme_vla.types import Batch, send
 from mme_vla.utils import Sums, checked_file, inside
 
 TOKENIZER_FILE = "tokenizer.model"
@@ -178,7 +178,7 @@ class Processor(PolicyProcessor):
             # safely.
             frames = torch.from_numpy(np.require(frames, requirements=["C", "W"]))
         if device is not None:
-            frames = frames.to(device)
+            frames = send(frames, torch.device(device))
         return resize_with_pad(frames, self.image_size)
 
     def prompt(

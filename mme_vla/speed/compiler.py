@@ -11,6 +11,13 @@ import torch
 from mme_vla.utils import user_cache
 
 CACHE_VARIABLE = "TORCHINDUCTOR_CACHE_DIR"
+CHOICE_OF_KERNELS = (
+    "torch.nn.attention._backend_from_string",
+    "torch.nn.attention._sdpa_kernel",
+)
+"""What `fused_kernels` leaves in a graph. PyTorch keeps no traced graph that calls these
+(pytorch#194007), although their arguments, which are in its key, say all that they do.
+"""
 
 
 def keep_compiled_code() -> Path:
@@ -25,6 +32,10 @@ def keep_compiled_code() -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o700)
         os.environ[CACHE_VARIABLE] = str(folder)
+    from torch._inductor import config
+
+    marked = dict.fromkeys(CHOICE_OF_KERNELS, torch.__version__)
+    config.unsafe_marked_cacheable_functions = config.unsafe_marked_cacheable_functions | marked
     return Path(os.environ[CACHE_VARIABLE])
 
 

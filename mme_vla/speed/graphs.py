@@ -81,7 +81,9 @@ class CapturedSampling:
 
     def _capture(self, inputs: Inputs, steps: int) -> _Captured:
         if self._pool is None:
-            self._pool, self._stream = torch.cuda.graph_pool_handle(), torch.cuda.Stream()
+            self._pool = torch.cuda.graph_pool_handle()
+        if self._stream is None:  # one for good: libraries keep workspaces for every stream
+            self._stream = torch.cuda.Stream()
         # Libraries choose their kernels and take their workspaces (cuBLAS 32 MiB a stream) in a
         # first run, which no graph may hold: on the stream that all graphs are captured on, so that
         # they are there.

@@ -197,8 +197,8 @@ class WeightUpdate:
     """Clips the gradients, moves the weights, and their average towards them.
 
     Clipping, AdamW and averaging are three passes over the weights, some 52 bytes a parameter with
-    the norm. With `one_pass` they are one compiled pass of 40 bytes, with fewer launches. It rounds
-    differently.
+    the norm. With `one_pass` they are one compiled pass of 40 bytes, a launch for each weight. It
+    rounds differently.
     """
 
     def __init__(
@@ -219,6 +219,9 @@ class WeightUpdate:
         self._optimizer, self._ema, self._clip_norm = optimizer, ema, clip_norm
         self._compiled: Callable[..., None] | None = None
         if one_pass:
+            # One code for each shape of a weight.
+            limit = torch._dynamo.config.recompile_limit
+            torch._dynamo.config.recompile_limit = max(limit, 256)
             self._compiled = torch.compile(_adamw_and_average, fullgraph=True, dynamic=False)
 
     @torch.no_grad()
@@ -251,61 +254,60 @@ class WeightUpdate:
             states = [self._optimizer.state[p] for p in parameters]
             steps = [state["step"] for state in states]
             torch._foreach_add_(steps, 1)
-            # In float64, as the optimizer corrects the moments' bias.
-            counts = torch.stack(steps).double()
+            # In float64, as the optimizer corrects the moments' bias; 16 bytes each, since compiled
+            # code copies what lies elsewhere.
+            counts = torch.stack(steps).double()[:, None].expand(-1, 4)
             first, second = group["betas"]
-            compiled(
-                parameters,
-                [p.grad for p in parameters],
-                [state["exp_avg"] for state in states],
-                [state["exp_avg_sq"] for state in states],
-                [averages[names[id(p)]] for p in parameters],
-                list((1 - first**counts).float().unbind()),
-                list((1 - second**counts).sqrt().float().unbind()),
-                factor,
-                # Tensors, since a number would be compiled into the code.
-                torch.tensor(group["lr"], dtype=torch.float64),
-                share,
-                (first, second, group["eps"], group["weight_decay"]),
-            )
+            corrections = (1 - first**counts).float()[:, 0].unbind()
+            root_corrections = (1 - second**counts).sqrt().float()[:, 0].unbind()
+            # Tensors, since a number would be compiled into the code.
+            rate = torch.tensor(group["lr"], dtype=torch.float64)
+            constants = (first, second, group["eps"], group["weight_decay"])
+            # Weights of one shape follow each other, so that their code is found at once.
+            for i in sorted(range(len(parameters)), key=lambda i: parameters[i].shape):
+                parameter, state = parameters[i], states[i]
+                compiled(
+                    parameter,
+                    parameter.grad,
+                    state["exp_avg"],
+                    state["exp_avg_sq"],
+                    averages[names[id(parameter)]],
+                    corrections[i],
+                    root_corrections[i],
+                    factor,
+                    rate,
+                    share,
+                    constants,
+                )
 
 
 def _adamw_and_average(
-    weights: list[Tensor],
-    gradients: list[Tensor],
-    means: list[Tensor],
-    squares: list[Tensor],
-    averages: list[Tensor],
-    corrections: list[Tensor],
-    root_corrections: list[Tensor],
+    weight: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    average: Tensor,
+    correction: Tensor,
+    root_correction: Tensor,
     factor: Tensor,
     rate: Tensor,
     share: Tensor,
     constants: tuple[float, float, float, float],
 ) -> None:
-    """Scale the gradients, take a step of AdamW (Loshchilov and Hutter, algorithm 2), and move the
-    averages by `share`, in place.
+    """Scale a gradient, take a step of AdamW (Loshchilov and Hutter, algorithm 2), and move the
+    average by `share`, in place. All weights at once would compile for minutes.
 
     Args:
-        means, squares: Adam's first and second moments.
-        corrections, root_corrections: of their bias, a number for each weight: 1 − β₁ᵗ and √(1 −
-            β₂ᵗ).
+        mean, square: Adam's first and second moments.
+        correction, root_correction: of their bias: 1 − β₁ᵗ and √(1 − β₂ᵗ).
         factor, rate, share: of the clipping, of learning, and 1 − decay of the average.
         constants: β₁, β₂, ε and the weight decay.
     """
     first, second, epsilon, decay = constants
-    clipped = torch._foreach_mul(gradients, factor)
-    torch._foreach_mul_(weights, 1 - rate * decay)
-    torch._foreach_lerp_(means, clipped, 1 - first)
-    torch._foreach_mul_(squares, second)
-    torch._foreach_addcmul_(squares, clipped, clipped, 1 - second)
-    roots = torch._foreach_sqrt(squares)
-    torch._foreach_div_(roots, root_corrections)
-    torch._foreach_add_(roots, epsilon)
-    steps = torch._foreach_div(means, corrections)
-    torch._foreach_div_(steps, roots)
-    torch._foreach_mul_(steps, rate)
-    torch._foreach_sub_(weights, steps)
-    changes = torch._foreach_sub(weights, averages)
-    torch._foreach_mul_(changes, share)
-    torch._foreach_add_(averages, changes)
+    clipped = gradient * factor
+    weight.mul_(1 - rate * decay)
+    mean.lerp_(clipped, 1 - first)
+    square.mul_(second).addcmul_(clipped, clipped, value=1 - second)
+    root = square.sqrt() / root_correction + epsilon
+    weight.sub_(mean / correction / root * rate)
+    average.add_((weight - average) * share)

@@ -162,3 +162,18 @@ def test_a_command_compiles_what_it_is_requested() -> None:
         prepare_sampling(policy, "graf", logger)
     with pytest.raises(UserError, match="needs a GPU"):
         prepare_sampling(policy, "graph", logger)
+
+
+def test_no_length_or_size_of_batch_is_one_too_many_to_compile(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, default in (("recompile_limit", 8), ("accumulated_recompile_limit", 256)):
+        monkeypatch.setattr(torch._dynamo.config, name, default)
+    policy = small_policy("pi05", **{"processor.prompt_length": 200}).eval()
+    policy.processor = None
+    policy.compile_sampling(layers=True)
+    # A layer has three kinds of code (prefix, its last layer, a step), for 13 lengths of prompt and
+    # batches of 1, 2, 4, … 64.
+    least = 3 * 13 * 7
+    assert torch._dynamo.config.recompile_limit > least
+    assert torch._dynamo.config.accumulated_recompile_limit > least

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch._dynamo.utils import counters
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.nn.functional import scaled_dot_product_attention
 
 from mme_vla.cli import loading
 from mme_vla.cli.loading import prepare_sampling
@@ -41,6 +44,24 @@ def test_a_folder_that_the_user_names_is_taken(
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "elsewhere"))
     assert keep_compiled_code() == tmp_path / "elsewhere"
     assert not (tmp_path / "cache").exists()
+
+
+def attend_with_math(x: Tensor) -> Tensor:
+    with sdpa_kernel([SDPBackend.MATH]):
+        return scaled_dot_product_attention(x, x, x)
+
+
+def test_the_traced_graph_of_an_attention_with_chosen_kernels_is_kept() -> None:
+    keep_compiled_code()
+    x = torch.ones(1, 1, 4, 8)
+    for _ in range(2):
+        torch.compiler.reset()
+        counters.clear()
+        with torch.no_grad():
+            torch.compile(attend_with_math, fullgraph=True)(x)
+    torch.compiler.reset()
+    assert counters["aot_autograd"]["autograd_cache_hit"] == 1
+    assert counters["aot_autograd"]["autograd_cache_bypass"] == 0
 
 
 def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

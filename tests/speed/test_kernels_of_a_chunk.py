@@ -111,7 +111,7 @@ def test_a_full_size_chunk_launches_few_kernels(
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     ("model", "launches", "products"),
-    [("pi05", 1870, 655), ("framesamp_modul", 2470, 876)],
+    [("pi05", 2070, 655), ("framesamp_modul", 2770, 876)],
 )
 def test_a_compiled_full_size_update_launches_few_kernels(
     model: str, launches: int, products: int, mock_driver: Path
