@@ -565,8 +565,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.rehearse:
         inductor_config.test_configs.max_mm_configs = 1  # tries one kernel of each product
         # A mock driver computes no constant: its code would be wrong on the GPU that it stands for.
-        own_folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-        os.environ.setdefault(CACHE_VARIABLE, own_folder.name)
+        temporary = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        os.environ.setdefault(CACHE_VARIABLE, temporary.name)
     keep_compiled_code()
     device, rank, processes = join_processes(args.device)
     setup = Setup(

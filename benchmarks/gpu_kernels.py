@@ -97,8 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The mock driver has no cuDNN. It computes no constant either: its code would be wrong on the
     # GPU that it stands for, and is not kept.
     torch.backends.cudnn.enabled = False
-    own_folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-    os.environ.setdefault(CACHE_VARIABLE, own_folder.name)
+    temporary = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+    os.environ.setdefault(CACHE_VARIABLE, temporary.name)
     for model in args.models:
         for way in args.ways:
             if args.what == "update":

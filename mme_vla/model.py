@@ -45,7 +45,7 @@ from mme_vla.backbone.base import Backbone, Injection
 from mme_vla.backbone.layers import Block, autocast
 from mme_vla.errors import UserError, check_known
 from mme_vla.integration.base import Integration
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import MemoryModule, encode_selection
 from mme_vla.types import Batch, MemoryTokens, Noise, to_unit_range
 
 
@@ -135,7 +135,7 @@ class MMEModel(nn.Module):
             return None
         with self.autocast():
             history = self.memory.condition_on_prompt(batch.history, self.prompt_condition(batch))
-            return self.memory.tokens_of(history)
+            return encode_selection(self.memory, history)
 
     def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
         """The observation's blocks with memory added. The batch's images are prepared.

@@ -174,7 +174,7 @@ def extensions() -> tuple[Extension, ...]:
     return extras() + installed_extensions()
 
 
-KEPT_OPTIONS = {
+LEFTOVER_OPTIONS = {
     key: "An option that you did not set is of the section's file: another name keeps it. Choose a"
     f" file with {key}=…, which brings its own options, or remove an option with ~{key}.<option>."
     for key in ("memory", "integration", "backbone", "subgoal")
@@ -341,8 +341,8 @@ class Registry[T]:
         for option in options:
             if option not in known:
                 hint = did_you_mean(option, known)
-                if self.key in KEPT_OPTIONS:
-                    hint += f" {KEPT_OPTIONS[self.key]}"
+                if self.key in LEFTOVER_OPTIONS:
+                    hint += f" {LEFTOVER_OPTIONS[self.key]}"
                 break
         text = ", ".join(f"{option}={brief(value)}" for option, value in options.items())
         return UserError(

@@ -12,7 +12,7 @@ from torch.overrides import TorchFunctionMode
 
 from mme_vla.backbone.base import Backbone
 from mme_vla.errors import UserError
-from mme_vla.registry import BACKBONES, KEPT_OPTIONS
+from mme_vla.registry import BACKBONES, LEFTOVER_OPTIONS
 
 _INITIALISERS = {Tensor.normal_, Tensor.uniform_}
 
@@ -53,7 +53,7 @@ def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
     except UserError as error:
         if sizes.keys() <= {spec.name for spec in fields(kind.Config)}:
             raise
-        raise UserError(f"{error} {KEPT_OPTIONS['backbone']}") from error
+        raise UserError(f"{error} {LEFTOVER_OPTIONS['backbone']}") from error
 
 
 def shape_of(section: Mapping[str, Any]) -> Backbone:

@@ -28,20 +28,22 @@ def library_trees() -> tuple[Path, ...]:
         if extension.configs is not None:
             owners[extension.configs] = extension.owner
     for extension in installed_extensions():
-        own = extension.configs
-        if own is None or own in owners:
+        tree = extension.configs
+        if tree is None or tree in owners:
             continue
-        require(own.is_dir(), f"{extension.owner} has no folder {own}: install it with its files.")
-        for file in sorted(own.rglob("*.yaml")):
+        require(
+            tree.is_dir(), f"{extension.owner} has no folder {tree}: install it with its files."
+        )
+        for file in sorted(tree.rglob("*.yaml")):
             for folder, owner in owners.items():
-                name = file.relative_to(own)
+                name = file.relative_to(tree)
                 require(
                     not (folder / name).exists(),
                     f"Two bring the configuration {str(name)!r}: {owner} ({folder / name}), and"
                     f" {extension.owner} ({file}). Rename the file in one of them, or uninstall"
                     " one.",
                 )
-        owners[own] = extension.owner
+        owners[tree] = extension.owner
     return tuple(owners)
 
 

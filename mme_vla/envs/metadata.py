@@ -179,7 +179,7 @@ _FIRST_SEED = {
     "train": (0, 1000), "val": (1_000_000, 10_000), "test": _TEST_SEED, MORE: (2_000_000, 100_000),
     RESERVED: (5_000_000, 10_000), **dict.fromkeys(FURTHER_SPLITS, _TEST_SEED),
 }  # fmt: skip
-_WholeNumber = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+_Number = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 
 
@@ -364,8 +364,8 @@ def file_name(task: str) -> str:
 class _OfficialEpisode(BaseModel):
     """What is read of an episode in an official metadata file."""
 
-    episode: _WholeNumber
-    seed: _WholeNumber
+    episode: _Number
+    seed: _Number
     difficulty: Literal["easy", "medium", "hard"]
 
 

@@ -121,21 +121,6 @@ class MemoryModule(nn.Module):
         """
         raise NotImplementedError
 
-    def tokens_of(self, history: HistoryTokens) -> MemoryTokens:
-        """What `forward` returns.
-
-        Raises:
-            UserError: it is no `MemoryTokens`.
-        """
-        tokens: MemoryTokens = self(history)
-        require(
-            isinstance(tokens, MemoryTokens),
-            f"{type(self).__name__}.forward returned {type(tokens).__name__}; expected"
-            " mme_vla.MemoryTokens(tokens, mask), [b, n, d] and bool [b, n] with n of at most"
-            f" budget={self.budget}.",
-        )
-        return tokens
-
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         """Frames that `select`, the scorer or the backbone may read at these steps.
 
@@ -204,7 +189,7 @@ class MemoryModule(nn.Module):
             streams: their states of `start_stream`, updated in place.
         """
         selections = [self.gather_selection(history, len(history) - 1) for history in histories]
-        return self.tokens_of(stack_history(selections))
+        return encode_selection(self, stack_history(selections))
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Do a part of the work of the next `encode` while the robot moves. It must not change any
@@ -482,6 +467,22 @@ class FrameMemory(MemoryModule):
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
         return all_patches(self.selected_frames(step, history.exec_start), self.storage.grid)
+
+
+def encode_selection(memory: "Memory", history: HistoryTokens) -> MemoryTokens:
+    """What the memory's `forward` returns.
+
+    Raises:
+        UserError: it is no `MemoryTokens`.
+    """
+    tokens: MemoryTokens = memory(history)
+    require(
+        isinstance(tokens, MemoryTokens),
+        f"{type(memory).__name__}.forward returned {type(tokens).__name__}; expected"
+        " mme_vla.MemoryTokens(tokens, mask), [b, n, d] and bool [b, n] with n of at most"
+        f" budget={memory.budget}.",
+    )
+    return tokens
 
 
 def check_scorer(memory: "Memory") -> None:

@@ -13,6 +13,7 @@ from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
     NEVER,
     MemoryModule,
+    encode_selection,
     pad_selection,
     union_frames,
 )
@@ -140,7 +141,7 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         outputs: dict[int, MemoryTokens] = {}
         for i, selection in self._split(history):
             memories[i].reporting = self.reporting
-            outputs[i] = memories[i].tokens_of(selection)
+            outputs[i] = encode_selection(memories[i], selection)
         return self._join([outputs[i] for i in range(len(memories))])
 
     def _split(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:

@@ -34,8 +34,8 @@ def keep_compiled_code() -> Path:
         os.environ[CACHE_VARIABLE] = str(folder)
     from torch._inductor import config
 
-    marked = dict.fromkeys(CHOICE_OF_KERNELS, torch.__version__)
-    config.unsafe_marked_cacheable_functions = config.unsafe_marked_cacheable_functions | marked
+    cacheable = dict.fromkeys(CHOICE_OF_KERNELS, torch.__version__)
+    config.unsafe_marked_cacheable_functions = config.unsafe_marked_cacheable_functions | cacheable
     return Path(os.environ[CACHE_VARIABLE])
 
 

@@ -124,22 +124,22 @@ def prepare_data(
     names = {*labels_read(*policy.modules()), data.weights}
     side_files = []
     for entry, source in zip(listed_sources(data.sources), sources, strict=True):
-        is_marked = entry.exec_starts is None
-        side_files.append(_side_files(source, is_marked, names, processor.samples.kind))
+        in_tables = entry.exec_starts is None
+        side_files.append(_side_files(source, in_tables, names, processor.samples.kind))
     return SplitData(train, val, [source.fingerprint for source in sources], side_files)
 
 
 def _side_files(
-    source: EpisodeSource, is_marked: bool, names: Collection[str | None], kind: str
+    source: EpisodeSource, in_tables: bool, names: Collection[str | None], kind: str
 ) -> dict[str, str]:
     """Digests of the files beside a dataset's content that training samples follow from.
 
-    is_marked: the tables say where execution begins.
+    in_tables: the tables say where execution begins.
     names: labels and weights that are read.
     kind: of the samples.
     """
     digests = {}
-    if not is_marked:
+    if not in_tables:
         digests["exec_starts"] = sha256(source.exec_starts.tobytes()).hexdigest()[:16]
     if FACT in names or FACT_VISIBLE in names:
         digests[FACTS] = sha256((source.root / FACTS).read_bytes()).hexdigest()[:16]

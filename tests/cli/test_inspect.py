@@ -83,8 +83,8 @@ def test_the_memory_of_a_checkpoint_is_rendered_with_the_tokens_that_it_reads(
 ) -> None:
     policy = small_policy(name)
     policy.save_pretrained(tmp_path / "policy")
-    chosen = [f"checkpoint={tmp_path / 'policy'}", "dataset=sample", f"output={tmp_path}"]
-    main(compose("inspect", [*chosen, "episode=1", "step=100"]))
+    words = [f"checkpoint={tmp_path / 'policy'}", "dataset=sample", f"output={tmp_path}"]
+    main(compose("inspect", [*words, "episode=1", "step=100"]))
     running = policy.start_episode(sample.goal(1))
     Recording(sample, 1).show(running, 0, 101)
     with torch.no_grad():
@@ -250,8 +250,8 @@ def test_weights_without_their_training_say_which_actions_they_were_paired_with(
     ]  # fmt: skip
     run = TrainRun.from_config(resolved(compose("train", words)))
     Policy.from_pretrained(train(run, tmp_path / "run", 0.0)).save_pretrained(tmp_path / "weights")
-    chosen = [f"checkpoint={tmp_path / 'weights'}", "dataset=sample", f"output={tmp_path}"]
-    inspection = Inspection.from_config(resolved(compose("inspect", [*chosen, "chunks=1"])))
+    words = [f"checkpoint={tmp_path / 'weights'}", "dataset=sample", f"output={tmp_path}"]
+    inspection = Inspection.from_config(resolved(compose("inspect", [*words, "chunks=1"])))
     result = check_open_loop(inspection, console)
     step = int(result.steps[0])
     assert (result.recorded[0] == sample.action_chunk(0, step, 20, 1)[0]).all()

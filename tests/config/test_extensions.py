@@ -96,7 +96,7 @@ def test_a_checkpoint_that_names_a_part_of_a_package_needs_trust(package: Path) 
     import_trusted(config, "a checkpoint", trust=True)
 
 
-def test_every_part_of_a_name_needs_trust(install: Callable[..., None]) -> None:
+def test_all_parts_with_one_name_need_trust(install: Callable[..., None]) -> None:
     """`json` is imported already, so that only the other module is foreign."""
     install(Extension(parts={"policy": {"mine": "first.policy"}, "processor": {"mine": "json"}}))
     with pytest.raises(UserError, match=r"needs the plugin first\.policy: code"):
@@ -243,7 +243,7 @@ def test_a_yaml_file_whose_name_is_taken_names_both_files(
         (tmp_path / "first" / shipped).unlink()
 
 
-def test_a_part_of_no_known_kind_is_refused(install: Callable[..., None]) -> None:
+def test_a_part_with_an_unknown_kind_is_refused(install: Callable[..., None]) -> None:
     install(Extension(parts={"memroy": {"mine": "first.part"}}))
     with pytest.raises(UserError, match=r"plugin 'first'.*kind of part='memroy'.*memory"):
         registry.extensions()

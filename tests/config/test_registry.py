@@ -78,7 +78,7 @@ def test_an_option_that_is_passed_on_is_named_where_no_constructor_takes_it() ->
         ("backbone", {"name": "nano"}),
     ],
 )
-def test_options_that_another_name_kept_are_said_to_be_of_the_file(
+def test_an_error_says_that_leftover_options_are_of_the_file(
     section: str, values: dict[str, object]
 ) -> None:
     if "only_budget" not in REGISTRIES["memory"]:

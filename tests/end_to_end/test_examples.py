@@ -185,8 +185,8 @@ def test_the_shortest_method_is_short_and_the_page_shows_its_names() -> None:
     texts = [file.read_text() for file in files]
     assert sum(len(text.splitlines()) for text in texts) <= 70
     page = (REPOSITORY / "docs" / "extend" / "add-a-method.md").read_text()
-    shown = (METHOD / "one_layer" / "extension.py").read_text().partition("from pathlib")[2]
-    assert f"from pathlib{shown}" in page
+    snippet = (METHOD / "one_layer" / "extension.py").read_text().partition("from pathlib")[2]
+    assert f"from pathlib{snippet}" in page
     entry_point = (METHOD / "pyproject.toml").read_text().partition("[project.entry")[2]
     assert f"[project.entry{entry_point}" in page
 

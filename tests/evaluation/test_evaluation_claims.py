@@ -139,7 +139,7 @@ def test_a_restarted_process_gives_back_its_unfinished_episodes(tmp_path: Path) 
         assert [taken(other.take(JOBS)) for _ in range(2)] == [1, 2]
 
 
-def test_an_episode_that_was_given_up_is_taken_again_by_a_repeated_command_alone(
+def test_an_episode_that_failed_for_good_is_run_again_by_a_repeated_command_alone(
     tmp_path: Path,
 ) -> None:
     names = [f"episodes-{i}of3.jsonl" for i in range(3)]

@@ -51,7 +51,7 @@ def attend_with_math(x: Tensor) -> Tensor:
         return scaled_dot_product_attention(x, x, x)
 
 
-def test_the_traced_graph_of_an_attention_with_chosen_kernels_is_kept() -> None:
+def test_the_traced_graph_of_an_attention_is_cached() -> None:
     keep_compiled_code()
     x = torch.ones(1, 1, 4, 8)
     for _ in range(2):

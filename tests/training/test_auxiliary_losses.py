@@ -232,8 +232,8 @@ def test_keyframes_learn_from_facts(tmp_path: Path) -> None:
 def test_side_files_that_are_read_count_as_data_and_no_others(tmp_path: Path) -> None:
     root = sample_with(tmp_path, (0, Fact("light", "red", (20, 30), (40,))))
     starts = tmp_path / "starts.json"
-    given = EpisodeSource(root).exec_starts.tolist()
-    starts.write_text(json.dumps(dict(enumerate(given))))
+    expected = EpisodeSource(root).exec_starts.tolist()
+    starts.write_text(json.dumps(dict(enumerate(expected))))
     entry = {"root": str(root), "exec_starts": str(starts)}
     blind = small_policy("framesamp_modul", memory={"budget": 64})
     counting = small_policy("keyframes_modul", memory={"label": FACT, "budget": 64})

@@ -1,6 +1,7 @@
 """What policies of prior methods share: memory tokens of a selection, and the kind of processor."""
 
 from mme_vla.errors import UserError
+from mme_vla.memory.base import encode_selection
 from mme_vla.policy.network import NetworkPolicy
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -13,7 +14,7 @@ class MethodPolicy(NetworkPolicy):
         if self.memory is None or history is None:
             return None
         with self.autocast():
-            return self.memory.tokens_of(history)
+            return encode_selection(self.memory, history)
 
 
 def processor_for[P](kind: type[P], processor: object, names: str) -> P | None:

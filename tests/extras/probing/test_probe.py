@@ -269,7 +269,7 @@ def test_recordings_are_read_as_the_policy_was_trained(
     policy = small_policy("framesamp_modul")
     policy.config["data"] = {"action_offset": 1}
     plans: list[ProbePlan] = []
-    monkeypatch.setattr(run_module, "run_probe", lambda _, plan, *rest: plans.append(plan))
+    monkeypatch.setattr(run_module, "run_probe", lambda _, plan, *others: plans.append(plan))
     probe(policy, "sample", ["shuffle"], output=tmp_path)
     assert {recording.action_offset for recording in plans[0].recordings} == {1}
 

@@ -166,7 +166,7 @@ def test_robots_without_depth_or_with_other_actions_are_refused() -> None:
         built(embodiment={"action": {"horizon": 2}})
 
 
-def test_kept_keyframes_count_as_data_of_a_run(
+def test_selected_keyframes_count_as_data_of_a_run(
     policy: SAM2ActPolicy, data: Path, tmp_path: Path
 ) -> None:
     copied = tmp_path / "data"
