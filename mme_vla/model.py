@@ -69,7 +69,8 @@ class MMEModel(nn.Module):
         backbone: constructed with `integration.extra_experts()`.
         memory: None for the policy without memory.
         integration: the base class `Integration` adds nothing.
-        compute_dtype: bfloat16 runs matrix products under autocast over float32 weights.
+        compute_dtype: float32 or bfloat16, which runs matrix products under autocast over float32
+            weights. An autocast around the model has no effect.
         transform_images: from views [b, v, 3, s, s] uint8, and in training the random numbers [b,
             …] of their augmentation, to views in [−1, 1] as the backbone reads them.
 
@@ -93,6 +94,8 @@ class MMEModel(nn.Module):
         transform_images: Callable[[Tensor, Tensor | None], Tensor] = unit_images,
     ) -> None:
         super().__init__()
+        if compute_dtype not in (torch.float32, torch.bfloat16):
+            raise ValueError(f"compute_dtype={compute_dtype}: choose float32 or bfloat16.")
         self.backbone = backbone
         self.register_module("memory", memory)
         self.integration = integration
@@ -108,7 +111,15 @@ class MMEModel(nn.Module):
         Args:
             batch: images uint8.
             augmentation: random numbers [b, …] of the image augmentation.
+
+        Raises:
+            ValueError: the images are not uint8.
         """
+        if batch.images.dtype != torch.uint8:
+            raise ValueError(
+                f"Batch.images must be uint8 0…255, got {batch.images.dtype}: the model scales them"
+                " to [−1, 1] itself."
+            )
         images = self.transform_images(batch.images, augmentation)
         past = batch.past
         if past is None:
@@ -175,7 +186,12 @@ class MMEModel(nn.Module):
             augmentation: random numbers [b, …] of the image augmentation; None augments nothing.
             metrics: receives what is worth logging, detached: `loss`, and if there are auxiliary
                 losses `losses/<name>` of all, unweighted; `memory/<name>` of the memory's own.
+
+        Raises:
+            ValueError: the batch has no actions, or does not fit the model.
         """
+        if batch.actions is None:
+            raise ValueError("A loss needs the recorded chunks: Batch.actions is None.")
         batch = self.prepare_images(batch, augmentation)
         if memory is None:
             memory = self.memory_tokens(batch)

@@ -52,9 +52,18 @@ class VisionTower(nn.Module):
         Args:
             frame_mask: [n, t] bool, False on frames of clips that are not there.
             every: see `PastViews`.
+
+        Raises:
+            ValueError: images of another size.
         """
         vit: Any = self.vit
         clips = images.shape[:-3]
+        size = vit.patch_embed.img_size
+        if images.shape[-3:] != (3, *size):
+            raise ValueError(
+                f"The vision tower reads images [3, {size[0]}, {size[1]}], got"
+                f" {list(images.shape[-3:])}: resize them, or set VisionConfig.image_size."
+            )
         images = images.flatten(0, -4)
         convolution = vit.patch_embed.proj
         # Patches and positions in float32, as released; then the compute dtype.
