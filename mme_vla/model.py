@@ -116,10 +116,7 @@ class MMEModel(nn.Module):
             ValueError: the images are not uint8.
         """
         if batch.images.dtype != torch.uint8:
-            raise ValueError(
-                f"Batch.images must be uint8 0…255, got {batch.images.dtype}: the model scales them"
-                " to [−1, 1] itself."
-            )
+            raise ValueError(f"Batch.images must be uint8 0…255, got {batch.images.dtype}.")
         images = self.transform_images(batch.images, augmentation)
         past = batch.past
         if past is None:
@@ -180,18 +177,13 @@ class MMEModel(nn.Module):
         ones of the memory.
 
         Args:
-            batch: with `actions`, on the model's device.
-            noise: as `training_noise` makes it, on that device.
+            batch, noise: with `actions`, and as `training_noise` makes it, on the model's device.
             memory: memory tokens; by default those of `batch.history`.
             augmentation: random numbers [b, …] of the image augmentation; None augments nothing.
             metrics: receives what is worth logging, detached: `loss`, and if there are auxiliary
                 losses `losses/<name>` of all, unweighted; `memory/<name>` of the memory's own.
-
-        Raises:
-            ValueError: the batch has no actions, or does not fit the model.
         """
-        if batch.actions is None:
-            raise ValueError("A loss needs the recorded chunks: Batch.actions is None.")
+        check_chunks(batch, noise)
         batch = self.prepare_images(batch, augmentation)
         if memory is None:
             memory = self.memory_tokens(batch)
@@ -293,6 +285,18 @@ def check_uncounted(block: Block, backbone: Backbone) -> None:
         " Block.positions=None. A backbone whose `supports` has 'positions', such as"
         " backbone=pi05, takes others."
     )
+
+
+def check_chunks(batch: Batch, noise: Mapping[str, Tensor]) -> None:
+    """Raise an error unless a batch has recorded chunks, of the shape of its noise."""
+    if batch.actions is None:
+        raise ValueError("A loss needs the recorded chunks: Batch.actions is None.")
+    chunks, random = list(batch.actions.shape), noise.get("noise")
+    if random is not None and list(random.shape) != chunks:
+        raise ValueError(
+            f"Batch.actions {chunks} and noise {list(random.shape)} differ in shape: pad actions"
+            " with zeros to the network's, and give training_noise() the number of samples."
+        )
 
 
 def check_auxiliary(name: str, values: Tensor, samples: int) -> None:

@@ -129,12 +129,6 @@ class FlowHead:
         x_τ = τε + (1 − τ)a, and the loss of a step is the mean over its numbers of (v − u)², where
         v = predict(x_τ, τ) and u = ε − a.
         """
-        if actions.shape != noise["noise"].shape:
-            raise ValueError(
-                f"Chunks {list(actions.shape)} and noise {list(noise['noise'].shape)} differ in"
-                f" shape: a chunk has {self.horizon} actions of {self.action_dim} numbers, padded"
-                " with zeros, and training_noise() takes the number of samples."
-            )
         x_t, target = interpolate(actions.float(), noise["noise"], noise["time"])
         return step_loss(predict(x_t, noise["time"]), target)
 

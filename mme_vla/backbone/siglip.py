@@ -60,10 +60,8 @@ class VisionTower(nn.Module):
         clips = images.shape[:-3]
         size = vit.patch_embed.img_size
         if images.shape[-3:] != (3, *size):
-            raise ValueError(
-                f"The vision tower reads images [3, {size[0]}, {size[1]}], got"
-                f" {list(images.shape[-3:])}: resize them, or set VisionConfig.image_size."
-            )
+            shape = list(images.shape[-3:])
+            raise ValueError(f"Images are {shape}: resize them to [3, {size[0]}, {size[1]}].")
         images = images.flatten(0, -4)
         convolution = vit.patch_embed.proj
         # Patches and positions in float32, as released; then the compute dtype.

@@ -91,11 +91,11 @@ def two_samples(**changed: torch.Tensor | None) -> Batch:
     ("changed", "message"),
     [
         ({"images": torch.zeros(2, 1, 3, 32, 32)}, "uint8 0…255, got torch.float32"),
-        ({"images": torch.zeros(2, 1, 3, 48, 48).byte()}, r"reads images \[3, 32, 32\], got"),
-        ({"images": torch.zeros(2, 1, 32, 32, 3).byte()}, r"got \[32, 32, 3\]"),
+        ({"images": torch.zeros(2, 1, 3, 48, 48).byte()}, r"resize them to \[3, 32, 32\]"),
+        ({"images": torch.zeros(2, 1, 32, 32, 3).byte()}, r"Images are \[32, 32, 3\]"),
         ({"actions": None}, "Batch.actions is None"),
-        ({"actions": torch.zeros(2, 20, 8)}, "20 actions of 32 numbers"),
-        ({"actions": torch.zeros(2, 10, 32)}, "20 actions of 32 numbers"),
+        ({"actions": torch.zeros(2, 20, 8)}, r"noise \[2, 20, 32\] differ in shape"),
+        ({"actions": torch.zeros(2, 10, 32)}, r"noise \[2, 20, 32\] differ in shape"),
     ],
 )
 def test_batch_that_does_not_fit_is_named(
