@@ -70,7 +70,8 @@ class MMEModel(nn.Module):
         backbone: constructed with `integration.extra_experts()`.
         memory: None for the policy without memory.
         integration: the base class `Integration` adds nothing.
-        compute_dtype: bfloat16 runs matrix products under autocast over float32 weights.
+        compute_dtype: float32 or bfloat16, which runs matrix products under autocast over float32
+            weights. An autocast around the model has no effect.
         transform_images: from views [b, v, 3, s, s] uint8, and in training the random numbers [b,
             …] of their augmentation, to views in [−1, 1] as the backbone reads them.
 
@@ -94,6 +95,8 @@ class MMEModel(nn.Module):
         transform_images: Callable[[Tensor, Tensor | None], Tensor] = unit_images,
     ) -> None:
         super().__init__()
+        if compute_dtype not in (torch.float32, torch.bfloat16):
+            raise ValueError(f"compute_dtype={compute_dtype}: choose float32 or bfloat16.")
         self.backbone = backbone
         self.register_module("memory", memory)
         self.integration = integration
@@ -109,7 +112,12 @@ class MMEModel(nn.Module):
         Args:
             batch: images uint8.
             augmentation: random numbers [b, …] of the image augmentation.
+
+        Raises:
+            ValueError: the images are not uint8.
         """
+        if batch.images.dtype != torch.uint8:
+            raise ValueError(f"Batch.images must be uint8 0…255, got {batch.images.dtype}.")
         images = self.transform_images(batch.images, augmentation)
         past = batch.past
         if past is None:
@@ -170,13 +178,13 @@ class MMEModel(nn.Module):
         ones of the memory.
 
         Args:
-            batch: with `actions`, on the model's device.
-            noise: as `training_noise` makes it, on that device.
+            batch, noise: with `actions`, and as `training_noise` makes it, on the model's device.
             memory: memory tokens; by default those of `batch.history`.
             augmentation: random numbers [b, …] of the image augmentation; None augments nothing.
             metrics: receives what is worth logging, detached: `loss`, and if there are auxiliary
                 losses `losses/<name>` of all, unweighted; `memory/<name>` of the memory's own.
         """
+        check_chunks(batch, noise)
         batch = self.prepare_images(batch, augmentation)
         if memory is None:
             memory = self.memory_tokens(batch)
@@ -278,6 +286,18 @@ def check_uncounted(block: Block, backbone: Backbone) -> None:
         " Block.positions=None. A backbone whose `supports` has 'positions', such as"
         " backbone=pi05, takes others."
     )
+
+
+def check_chunks(batch: Batch, noise: Mapping[str, Tensor]) -> None:
+    """Raise an error unless a batch has recorded chunks, of the shape of its noise."""
+    if batch.actions is None:
+        raise ValueError("A loss needs the recorded chunks: Batch.actions is None.")
+    chunks, random = list(batch.actions.shape), noise.get("noise")
+    if random is not None and list(random.shape) != chunks:
+        raise ValueError(
+            f"Batch.actions {chunks} and noise {list(random.shape)} differ in shape: pad actions"
+            " with zeros to the network's, and give training_noise() the number of samples."
+        )
 
 
 def check_auxiliary(name: str, values: Tensor, samples: int) -> None:

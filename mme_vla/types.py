@@ -83,8 +83,17 @@ class TensorStruct:
         return type(self)(**values)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Return a copy whose tensors went through `Tensor.to` with these arguments."""
-        return self._map(lambda x: x.to(*args, **kwargs))
+        """Return a copy whose tensors went through `Tensor.to` with these arguments. As in
+        `nn.Module.to`, masks and integers keep their type.
+        """
+
+        def moved(x: Tensor) -> Tensor:
+            y = x.to(*args, **kwargs)
+            if x.is_floating_point() or y.dtype == x.dtype:
+                return y
+            return x.to(y.device)
+
+        return self._map(moved)
 
     def sent(self, device: torch.device) -> Self:
         """Return a copy on a device, made without waiting: see `send`."""

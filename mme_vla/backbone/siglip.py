@@ -52,9 +52,16 @@ class VisionTower(nn.Module):
         Args:
             frame_mask: [n, t] bool, False on frames of clips that are not there.
             every: see `PastViews`.
+
+        Raises:
+            ValueError: images of another size.
         """
         vit: Any = self.vit
         clips = images.shape[:-3]
+        size = vit.patch_embed.img_size
+        if images.shape[-3:] != (3, *size):
+            shape = list(images.shape[-3:])
+            raise ValueError(f"Images are {shape}: resize them to [3, {size[0]}, {size[1]}].")
         images = images.flatten(0, -4)
         convolution = vit.patch_embed.proj
         # Patches and positions in float32, as released; then the compute dtype.

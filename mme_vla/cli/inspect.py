@@ -278,10 +278,8 @@ def show_unknown_robot(dataset: str, robot: Embodiment, output: Path, console: C
     info = read_info(root)
     try:
         find_columns(root, info.features, robot)
-    except UserError as reason:
+    except UserError:
         draft = draft_robot(root, info, list(yaml_files(library_trees(), "embodiment")))
-        if draft is None:
-            raise reason
     else:
         return False
     path, is_new = save_draft(draft, output)

@@ -245,8 +245,9 @@ def _missing_columns(
             " a checkpoint that was trained in joint angles."
         )
     message += (
-        f" These are the names of the robot {robot.name!r}: choose embodiment=<the robot this"
-        " dataset is of>, or name its columns in a configs/embodiment file of your own."
+        f" These are the names of the robot {robot.name!r}: take a dataset of this robot (a"
+        " checkpoint keeps its own), choose embodiment=<the robot this dataset is of>, or name its"
+        " columns in a configs/embodiment file of your own."
     )
     for name in missing:
         near = _near_column(name, features)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.lerobot_files import Feature, Info, names_of
-from mme_vla.errors import printable
+from mme_vla.errors import UserError, listed, printable
 
 CHECK = "check:"
 """Begins the comments of lines that a dataset cannot tell."""
@@ -36,9 +36,8 @@ class RobotDraft:
     open_lines: tuple[str, ...]
 
 
-def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft | None:
-    """Write the YAML file of the robot that a dataset is of; None where no camera, no state or no
-    action can be found.
+def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft:
+    """Write the YAML file of the robot that a dataset is of.
 
     Cameras, widths, names and rate are the dataset's. Guessed, and marked so: the camera that feeds
     memory, cameras that move with a hand (by their names), numbers that are relative to the state
@@ -48,6 +47,9 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
         root: of the dataset; its folder's name becomes the robot's.
         info: its description.
         taken: names that other robots have.
+
+    Raises:
+        UserError: no camera, no state or no action was found.
     """
     name = re.sub(r"\W+", "_", root.resolve().name.lower(), flags=re.ASCII).strip("_") or "robot"
     if name in taken or name[0].isdigit():
@@ -55,8 +57,15 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
     cameras = _cameras(info.features)
     state = _vectors(info.features, ("observation.state", "state"), "observation.")
     action = _vectors(info.features, ("action", "actions"), "action")
-    if not cameras or not state or not action:
-        return None
+    needed = {"a camera": cameras, "a state": state, "an action": action}
+    absent = [part for part, columns in needed.items() if not columns]
+    if absent:
+        raise UserError(
+            f"{root} has no column of {' and none of '.join(absent)}, and a policy needs all three:"
+            f" observation.images.<camera>, observation.state and action. It has"
+            f" {listed(info.features)}. Name others in a file of your own, which"
+            " docs/extend/your-robot.md explains, or record them."
+        )
     state_features = [info.features[column] for column in state]
     action_features = [info.features[column] for column in action]
     state_width = sum(feature.width for feature in state_features)

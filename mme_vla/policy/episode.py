@@ -1,5 +1,6 @@
 """One running episode: all streaming state is here, never on the policy."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment import Option
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.history import History, LazyHistory, OnlineHistory
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
@@ -50,7 +51,10 @@ class Episode:
     def __init__(self, policy: "Policy", goal: str, seed: int = 0) -> None:
         self._policy = policy
         self._robot = policy.embodiment
-        self._generator = torch.Generator().manual_seed(seed)
+        try:
+            self._generator = torch.Generator().manual_seed(operator.index(seed))
+        except (TypeError, ValueError):  # another type, or more than 64 bits
+            raise UserError(f"seed={brief(seed)} must be a whole number of 64 bits.") from None
         self._recent: list[tuple[Tensor | None, Tensor]] = []
         """Images (None: not rendered) and states of the observation's window, the current frame
         last.

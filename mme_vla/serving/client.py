@@ -82,8 +82,12 @@ class Client:
         self._socket = self._ends.enter_context(opening)
         self.metadata = self._receive(self.open_timeout)
 
-    def reset(self) -> dict[str, Any]:
-        return self.request({"reset": True})
+    def reset(self, seed: int | None = None) -> dict[str, Any]:
+        """Begin an episode, its noise from this seed, else from the server's."""
+        message: dict[str, Any] = {"reset": True}
+        if seed is not None:
+            message["seed"] = seed
+        return self.request(message)
 
     def add_buffer(
         self, images: np.ndarray, states: np.ndarray, exec_start: int = 0

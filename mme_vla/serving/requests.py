@@ -235,7 +235,6 @@ def _shaped(*shape: int | None) -> Any:
 
 IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}
 """openpi's names of RoboMME's cameras."""
-KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
 
 
 Index = Annotated[StrictInt, Field(ge=0), BeforeValidator(_integer)]
@@ -372,7 +371,7 @@ class RequestReader:
         keys = [key for key in message if isinstance(key, str)]
         if any(key.startswith("observation/") for key in keys):
             return self._one_observation(message)
-        raise _unknown(keys[:10])
+        raise _unknown(keys[:10], self._robot.camera_names[0])
 
     def _add_buffer(self, message: dict[Any, Any]) -> AddBuffer:
         readings = ", ".join(self._robot.readings)
@@ -488,16 +487,18 @@ def _check_lengths(lengths: Mapping[str, int]) -> None:
         raise UserError(f"All lists need one entry a frame: {counts}.")
 
 
-def _unknown(keys: list[str]) -> UserError:
-    """Explain that these keys are of no request."""
-    unknown = [key for key in keys if key not in KNOWN]
+def _unknown(keys: list[str], camera: str) -> UserError:
+    """Explain that these keys are of no request of a robot with this camera."""
+    image = IMAGE_KEYS.get(camera, f"observation/{camera}")
+    known = ("reset", "add_buffer", image, f"{camera}_rgb_list")
+    unknown = [key for key in keys if key not in known]
     if keys and not unknown:  # reset=true and add_buffer=true are requests
         false = " and ".join(f"{key}=false" for key in keys)
         return UserError(
             f"{false}: no request. Send reset=true, or an observation with the keys"
-            " observation/image, … or front_rgb_list, …"
+            f" {image}, … or {camera}_rgb_list, …"
         )
-    hint = f"Known: {', '.join(KNOWN)}."
+    hint = f"Known: {', '.join(known)}."
     if unknown:
-        hint = did_you_mean(unknown[0], KNOWN)
+        hint = did_you_mean(unknown[0], known)
     return UserError(f"No known request has the keys {keys}. {hint}")

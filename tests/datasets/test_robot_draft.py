@@ -3,11 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
 from omegaconf import OmegaConf
 
 from mme_vla.data.lerobot_files import Info, find_columns
 from mme_vla.data.robot_draft import CHECK, RobotDraft, draft_robot, save_draft
 from mme_vla.embodiment import Embodiment
+from mme_vla.errors import UserError
 
 IMAGE = {"dtype": "video", "shape": [120, 160, 3]}
 
@@ -100,7 +102,12 @@ def test_name_of_another_robot_is_not_taken() -> None:
 
 
 def test_without_images_or_actions_there_is_no_draft() -> None:
-    assert draft_robot(Path("data"), info_of(observation__state=vector(width=2))) is None
+    """The message names what is absent, and not the command that drafts, which the reader ran."""
+    with pytest.raises(UserError, match="no column of a camera and none of an action") as error:
+        draft_robot(Path("data"), info_of(observation__state=vector(width=2)))
+    assert "mme-vla inspect" not in str(error.value)
+    with pytest.raises(UserError, match="no column of a state,"):
+        draft_robot(Path("data"), info_of(top=IMAGE, action=vector(width=2)))
 
 
 def test_existing_file_stays(tmp_path: Path) -> None:

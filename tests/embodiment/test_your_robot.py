@@ -223,7 +223,8 @@ def test_columns_are_detected_in_both_spellings_joined_or_by_name(place: Path) -
             robot=Embodiment.from_dict({**robot.to_dict(), "action": {"width": 7}}),
         )
     with pytest.raises(
-        UserError, match=r"lacks the features image, wrist_image.*choose embodiment="
+        UserError,
+        match=r"lacks the features image, wrist_image.*take a dataset of this.*choose embodiment=",
     ):
         EpisodeSource("demonstrations")
     shortened = {"cameras": {"eye": {"key": "images.left_wrst"}}, "memory_camera": "eye"}

@@ -158,6 +158,30 @@ def test_actions_are_those_of_the_policy_in_process(
     np.testing.assert_array_equal(actions, expected)
 
 
+def test_a_robot_of_ones_own_comes_from_a_folder(package: ModuleType, tmp_path: Path) -> None:
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    (tmp_path / "embodiment").mkdir()
+    (tmp_path / "embodiment/arm.yaml").write_text(
+        "name: arm\ncameras: {head: {augment: none}}\nmemory_camera: head\n"
+        "state: {width: 2}\naction: {width: 2, horizon: 4, execute: 4}\n"
+    )
+    features = {
+        "input_features": {
+            "observation.images.head": PolicyFeature(FeatureType.VISUAL, (3, 24, 32)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (2,)),
+        },
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (2,))},
+        "device": "cpu",
+    }
+    with pytest.raises(UserError, match=r"--policy\.config_dir=.*--rename_map="):
+        package.modeling_mme_vla.MMEVLAPolicy(package.MMEVLAConfig(**features))
+    config = package.MMEVLAConfig(
+        **features, config_dir=str(tmp_path), overrides=["embodiment=arm", "backbone=tiny"]
+    )
+    assert package.modeling_mme_vla.MMEVLAPolicy(config).model.embodiment.name == "arm"
+
+
 def test_a_checkpoint_goes_there_and_back(
     package: ModuleType, our_folder: Path, lerobot_folder: Path, tmp_path: Path
 ) -> None:

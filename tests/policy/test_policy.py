@@ -1,5 +1,6 @@
 """What every composition has to do, whatever memory and integration it is made of."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -227,6 +228,25 @@ def test_unknown_names_are_answered_with_the_near_ones():
         build_policy("tokendrp_expert")
     with pytest.raises(UserError, match="budget"):
         build_policy("framesamp_context", memory={"bugdet": 256})
+
+
+def test_seed_of_an_episode_may_be_any_integer():
+    policy = small_policy("pi05", backbone=FEW_TOKENS)
+    state = policy.start_episode("go", 3).noise_state
+    assert torch.equal(policy.start_episode("go", np.int64(3)).noise_state, state)
+    for seed in (None, 1.5, "7", 2**64):
+        with pytest.raises(UserError, match="must be a whole number of 64 bits"):
+            policy.start_episode("go", seed)
+
+
+def test_change_of_precision_keeps_masks_and_indices():
+    batch = random_batch(small_policy("framesamp_modul", backbone=FEW_TOKENS, memory=MEMORY))
+    half = batch.to(dtype=torch.bfloat16)
+    assert half.actions.dtype == half.history.features.dtype == torch.bfloat16
+    for name in ("images", "image_mask", "prompt", "prompt_mask"):
+        assert getattr(half, name).dtype == getattr(batch, name).dtype
+    assert half.history.mask.dtype == torch.bool
+    assert batch.to("meta", torch.bfloat16).prompt_mask.device.type == "meta"
 
 
 def test_bfloat16_compute_stays_close_to_float32(remembering):

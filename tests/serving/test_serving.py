@@ -221,6 +221,18 @@ def test_an_episode_cannot_outgrow_the_limit(policy):
         client.add_buffer(part[0], part[2])
 
 
+def test_the_client_chooses_the_noise_of_an_episode(served):
+    with served.client() as client:
+        chunks = []
+        front, wrist, state = course()[0]
+        for seed in (3, 3, 4):
+            client.reset(seed)
+            client.add_buffer(front, state)
+            chunks.append(client.infer(observation(front[-1], wrist[-1], state[-1]))["actions"])
+    np.testing.assert_array_equal(chunks[0], chunks[1])
+    assert not np.allclose(chunks[0], chunks[2])
+
+
 def test_a_refused_request_leaves_the_episode_as_it_was(policy):
     """The actions are those of an episode in which the refused requests never came."""
     parts = course()[:2]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.serving_fakes import GOAL, challenge, observation, states
-from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
 from mme_vla.serving import pack, unpack
 from mme_vla.serving.codec import check_size
@@ -285,3 +285,22 @@ def test_a_first_message_of_the_longest_episode_passes():
         "front_camera_extrinsic_list",
     )
     assert set(unpack(pack({key: [np.zeros(3, np.uint8)] * frames for key in lists}))) == set(lists)
+
+
+def test_keys_of_another_library_are_answered_with_those_of_the_robot():
+    """A robot of one's own has no observation/image."""
+    arm = {
+        "name": "arm",
+        "cameras": {"head": {}},
+        "memory_camera": "head",
+        "state": {"width": 2},
+        "action": {"width": 2},
+    }
+    reader = RequestReader(Embodiment.from_dict(arm), 10)
+    with pytest.raises(UserError, match=r"observation/head") as error:
+        reader.parse({"observation.images.head": IMAGE, "observation.state": [0.0, 0.0]})
+    assert "observation/image" not in str(error.value)
+    with pytest.raises(UserError, match=r"observation/head, … or head_rgb_list"):
+        reader.parse({"reset": False})
+    with pytest.raises(UserError, match=r"observation/image, … or front_rgb_list"):
+        parse({"reset": False})

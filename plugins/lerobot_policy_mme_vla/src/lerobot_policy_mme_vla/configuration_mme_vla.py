@@ -20,12 +20,13 @@ class MMEVLAConfig(PreTrainedConfig):
     """A composition of mme-vla by its name, with overrides in the words of its own commands.
 
     model, overrides: `--policy.model=framesamp_modul
-    --policy.overrides='["backbone=pi05","memory.budget=256"]'`. init_from: weights to start from,
-    in any format that mme-vla reads. composition: the whole configuration as JSON; saving writes
-    it, so that a checkpoint needs no other file for it. exec_starts: side file of first execution
-    frames, for datasets that do not mark their conditioning video. cache_root: folder of the vision
-    caches that a memory trains on. max_build_frames: larger datasets have theirs built
-        beforehand (`mme-vla cache`). cache_local: every machine has a `cache_root` of its own.
+    --policy.overrides='["backbone=pi05","memory.budget=256"]'`. config_dir: a folder of YAML files
+    of one's own, such as a robot's. init_from: weights to start from, in any format that mme-vla
+    reads. composition: the whole configuration as JSON; saving writes it, so that a checkpoint
+    needs no other file for it. exec_starts: side file of first execution frames, for datasets that
+    do not mark their conditioning video. cache_root: folder of the vision caches that a memory
+    trains on. max_build_frames: larger datasets have theirs built beforehand (`mme-vla cache`).
+    cache_local: every machine has a `cache_root` of its own.
     freeze_vision: leave the vision tower as it is; a memory needs that.
     n_action_steps: actions of a chunk that are executed; by default the embodiment's. flow_steps:
     of the sampler. seed: of fresh weights, and of every episode's noise.
@@ -33,6 +34,7 @@ class MMEVLAConfig(PreTrainedConfig):
 
     model: str = "framesamp_modul"
     overrides: list[str] = field(default_factory=list)
+    config_dir: str | None = None
     init_from: str | None = None
     composition: str | None = None
     exec_starts: str | None = None
@@ -121,6 +123,8 @@ def image_key(camera: Camera, features: Collection[str]) -> str:
             return str(name)
     raise UserError(
         f"No images of the camera {camera.name!r}: none of {', '.join(names)} is among"
-        f" {listed(sorted(features))}. Say which it is with"
+        f" {listed(sorted(features))}. For another robot, draft its file with `mme-vla inspect"
+        " dataset=<folder>` and add --policy.config_dir=outputs/inspect"
+        " --policy.overrides='[\"embodiment=<name>\"]'. For the same camera under another name, add"
         ' --rename_map=\'{"observation.images.<theirs>": "' + names[0] + "\"}'."
     )

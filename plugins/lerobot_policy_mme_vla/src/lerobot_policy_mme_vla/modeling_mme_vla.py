@@ -247,9 +247,9 @@ class MMEVLAPolicy(PreTrainedPolicy):
 
 def _built(config: MMEVLAConfig) -> Policy:
     """The policy that a configuration describes, with fresh weights or those to start from."""
-    model = build_from_config(
-        compose("policy", [f"model={config.model}", *config.overrides]), seed=config.seed
-    )
+    folders = [] if config.config_dir is None else [Path(config.config_dir).resolve()]
+    words = [f"model={config.model}", *config.overrides]
+    model = build_from_config(compose("policy", words, extra_dirs=folders), seed=config.seed)
     if config.init_from is not None:
         start_from(model, config.init_from)
     return model
