@@ -495,7 +495,8 @@ def show_dataset(source: EpisodeSource, console: Console) -> None:
     for what, names in (("state", source.state_names), ("action", source.robot.action.names)):
         if names:
             console.print(
-                f"{what}: {len(names)} numbers: {printable(', '.join(names))}", highlight=False
+                f"{what}: {counted(len(names), 'number')}: {printable(', '.join(names))}",
+                highlight=False,
             )
     if compared:
         checksums = f"all {compared} files are as they were written"

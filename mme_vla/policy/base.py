@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.episode import Episode, executable_actions
 from mme_vla.policy.identity import PolicyIdentity
@@ -422,6 +422,10 @@ def choose_actions(
         sample_chunk: in place of `Policy.predict_chunk`, from the observation and its noise to the
             normalised chunk [n, h, a].
     """
+    require(
+        all(episode.policy is policy for episode in episodes),
+        "An episode belongs to another policy: act with the one whose start_episode() made it.",
+    )
     policy.require_processor().require_stats()  # before the noise or memory of an episode changes
     batch = policy.observation(episodes)
     noise = stack_noise([episode.draw() for episode in episodes])

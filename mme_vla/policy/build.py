@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.backbone.building import shapes_only
+from mme_vla.config.devices import find_device
 from mme_vla.config.naming import words
 from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
@@ -189,10 +190,11 @@ def build_from_config(
         )
     if seed is None:
         seed = values.get("seed", 42)
-    is_on_meta = torch.device(device).type == "meta"
+    target = find_device(str(device))
+    is_on_meta = target.type == "meta"
     # On meta the tokenizer is not needed.
     processor = None if is_on_meta else build_processor(sections)
-    place = shapes_only() if is_on_meta else torch.device(device)
+    place = shapes_only() if is_on_meta else target
     with torch.random.fork_rng(devices=[]), place:
         torch.manual_seed(seed)
         policy: Policy = policy_class(sections).from_config(

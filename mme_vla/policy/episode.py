@@ -1,9 +1,10 @@
 """One running episode: all streaming state is here, never on the policy."""
 
+import copy
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -46,10 +47,13 @@ class Failure:
 
 
 class Episode:
-    """State of one episode: goal, current view and robot state, history of past frames, noise."""
+    """State of one episode: goal, current view and robot state, history of past frames, noise.
+
+    policy: the one that started it, and acts in it. Copies of an episode share it.
+    """
 
     def __init__(self, policy: "Policy", goal: str, seed: int = 0) -> None:
-        self._policy = policy
+        self.policy = policy
         self._robot = policy.embodiment
         try:
             self._generator = torch.Generator().manual_seed(operator.index(seed))
@@ -95,6 +99,13 @@ class Episode:
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""
         self._executed = self._no_actions
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        memo[id(self.policy)] = self.policy
+        episode = object.__new__(type(self))
+        memo[id(self)] = episode
+        episode.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        return episode
 
     def observe(
         self,
@@ -145,7 +156,7 @@ class Episode:
             return
         indices = dict.fromkeys(images) if rendered is None else rendered
         views = {name: FrameBatch.of(view, indices[name], count) for name, view in images.items()}
-        processor = self._policy.require_processor()
+        processor = self.policy.require_processor()
         check_reach(states, self._state_stats(), "a state")
         demo, executed = self._checked_course(count, demo, actions)
         # Execution frames within the window; the current frame in any case.
@@ -231,7 +242,7 @@ class Episode:
                 f"set_view() needs an image of {', '.join(missing)} too; got"
                 f" {', '.join(views) or 'none'}."
             )
-        processor = self._policy.require_processor()
+        processor = self.policy.require_processor()
         check_reach(state, self._state_stats(), "the state")
         images = processor.images([views[name] for name in names])
         newest = (images, torch.from_numpy(state.copy()))
@@ -241,7 +252,7 @@ class Episode:
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
         history = self.required_history()
-        return self._policy.require_memory().gather_selection(history, len(history) - 1)
+        return self.policy.require_memory().gather_selection(history, len(history) - 1)
 
     def required_history(self) -> OnlineHistory:
         """The history, once it has a frame.
@@ -283,7 +294,7 @@ class Episode:
             UserError: no frame was observed, or one of these was not rendered.
         """
         self._require_observation()
-        missing = self._policy.require_processor().samples.window - len(self._recent)
+        missing = self.policy.require_processor().samples.window - len(self._recent)
         frames = [self._recent[0]] * missing + self._recent
         images = torch.stack([self._require_rendered(images) for images, _ in frames])
         return images, torch.stack([state for _, state in frames])
@@ -297,12 +308,12 @@ class Episode:
         """
         if self._past is None:
             return None
-        return self._past.at(self.n_observed_frames - 1, self._policy.require_processor().images)
+        return self._past.at(self.n_observed_frames - 1, self.policy.require_processor().images)
 
     @property
     def prompt(self) -> Any:
         """The processor's encoding of goal and subgoal."""
-        processor = self._policy.require_processor()
+        processor = self.policy.require_processor()
         state = self._recent[-1][1] if self._recent else None
         goal = self._robot.action.worded(checked_goal(self.goal), self.options)
         return processor.prompt(
@@ -385,11 +396,11 @@ class Episode:
         """Sample the next chunk's random numbers from this episode's own generator, independent of
         batching.
         """
-        return self._policy.sampling_noise(self._generator)
+        return self.policy.sampling_noise(self._generator)
 
     def _state_stats(self) -> QuantileStats | None:
         """Statistics of the state, once the processor has any."""
-        stats = self._policy.require_processor().stats
+        stats = self.policy.require_processor().stats
         return None if stats is None else stats.state
 
     @property
@@ -444,10 +455,10 @@ class Episode:
         """Append checked frames of the memory camera to the history, and the actions that led to
         them.
         """
-        processor = self._policy.require_processor()
+        processor = self.policy.require_processor()
         if self.history is not None:
             motion: list[Tensor] = []
-            if self._policy.require_memory().uses_proprio:
+            if self.policy.require_memory().uses_proprio:
                 if states is None:
                     raise UserError(
                         "This policy's memory reads the robot's own states and actions: give past"
@@ -460,7 +471,7 @@ class Episode:
                     actions[rows] = executed[: len(rows)]
                     known[rows] = True
                 motion += motion_rows(processor, states, actions, known)
-            self.history.take(frames, self._policy.encode_frames)
+            self.history.take(frames, self.policy.encode_frames)
             self._motion_of_frames += motion
             if not self._video_over:
                 self.history.exec_start = self.n_observed_frames + int(demo.sum())
@@ -479,7 +490,7 @@ class Episode:
         rendered = [image for image in images if image is not None]
         if len(rendered) < len(images):
             return None
-        return self._policy.require_processor().images(rendered)
+        return self.policy.require_processor().images(rendered)
 
     def _require_rendered(self, images: Tensor | None) -> Tensor:
         if images is None:

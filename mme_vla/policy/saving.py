@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.building import shapes_only
+from mme_vla.config.devices import find_device
 from mme_vla.config.naming import DECISIVE, digest, flat
 from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT
@@ -279,6 +280,7 @@ def load_policy[P: "Policy"](
     """
     from mme_vla.processing.base import load_processor
 
+    place = find_device(str(device))
     requested_dtype = None if dtype == "auto" else dtype_of(dtype)
     folder = local_folder(source, revision, token)
     require(
@@ -304,8 +306,8 @@ def load_policy[P: "Policy"](
 
     # Precision: `auto` rounds on a GPU, if the policy is made for it.
     kind = requested_dtype or torch.float32
-    is_on_gpu = torch.device(device).type == "cuda"
-    if requested_dtype is None and is_on_gpu and getattr(policy_type, "acts_in_bfloat16", False):
+    in_bfloat16 = getattr(policy_type, "acts_in_bfloat16", False)
+    if requested_dtype is None and place.type == "cuda" and in_bfloat16:
         kind = torch.bfloat16
     settings: dict[str, Any] = {}
     if kind == torch.bfloat16:
@@ -321,7 +323,7 @@ def load_policy[P: "Policy"](
     policy._renews_self_check = (folder / SELF_CHECK).is_file()
     if kind == torch.bfloat16:
         policy.requires_grad_(False)
-    return policy.to(device).eval()
+    return policy.to(place).eval()
 
 
 def build_saved[P: "Policy"](

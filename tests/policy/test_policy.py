@@ -1,12 +1,20 @@
 """What every composition has to do, whatever memory and integration it is made of."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.testing.small import SMALL_VISION, random_batch, random_history, small_policy
+from mme_vla.testing.small import (
+    SMALL_VISION,
+    moving_frames,
+    random_batch,
+    random_history,
+    small_policy,
+)
 from mme_vla.utils import SUMS
 
 TOLERANCE = 2e-5
@@ -237,6 +245,37 @@ def test_seed_of_an_episode_may_be_any_integer():
     for seed in (None, 1.5, "7", 2**64):
         with pytest.raises(UserError, match="must be a whole number of 64 bits"):
             policy.start_episode("go", seed)
+
+
+@pytest.mark.parametrize("model", ["framesamp_modul", "rmt_context"])
+def test_copies_of_an_episode_share_its_policy_and_nothing_else(model):
+    policy = small_policy(model, backbone=FEW_TOKENS, memory=MEMORY)
+    frames = moving_frames(5, size=policy.backbone.image_size)
+    views = {"front": frames, "wrist": frames}
+    episode = policy.start_episode("press the button")
+    episode.observe(views, np.zeros((5, 8), np.float32))
+    branch = copy.deepcopy(episode)
+    assert branch.policy is policy
+    first = policy.act(branch)
+    branch.observe(views, np.ones((5, 8), np.float32))
+    policy.act(branch)
+    assert (policy.act(episode) == first).all()
+
+
+def test_an_episode_of_another_policy_is_refused():
+    policy, other = (small_policy("pi05", backbone=FEW_TOKENS) for _ in range(2))
+    frames = moving_frames(1, size=policy.backbone.image_size)
+    episode = policy.start_episode("press the button")
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((1, 8), np.float32))
+    before = episode.noise_state
+    with pytest.raises(UserError, match="An episode belongs to another policy"):
+        other.act([episode])
+    assert torch.equal(episode.noise_state, before)
+
+
+def test_a_device_that_is_none_is_refused():
+    with pytest.raises(UserError, match="device='cudo' is not a device; choose auto, cpu, cuda"):
+        build_policy("pi05", device="cudo")
 
 
 def test_change_of_precision_keeps_masks_and_indices():

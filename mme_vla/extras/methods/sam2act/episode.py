@@ -107,7 +107,7 @@ class KeyframeEpisode(Episode):
     first execution frame is there.
     """
 
-    _policy: "SAM2ActPolicy"
+    policy: "SAM2ActPolicy"
 
     def __init__(self, policy: "SAM2ActPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
@@ -144,7 +144,7 @@ class KeyframeEpisode(Episode):
         super().observe(frames, states, is_demo, actions, rendered)
         demo = np.broadcast_to(np.asarray(is_demo, bool), (len(states),))
         places = range(len(demo)) if rendered is None else next(iter(rendered.values())).tolist()
-        processor = self._policy.require_processor()
+        processor = self.policy.require_processor()
         fingers = np.asarray(states, np.float32)[:, -1]
         for i, at in enumerate(places):
             if demo[at]:
@@ -156,7 +156,7 @@ class KeyframeEpisode(Episode):
             for place, index in enumerate(indices):
                 shots, finger = self._video[index]
                 scene = self._scene_inputs(shots, finger, place)
-                self.remembered = self._policy.watch(scene, self.remembered)
+                self.remembered = self.policy.watch(scene, self.remembered)
             self._video = []
             if self._after is not None:
                 self.remembered, self._after = self._after, None
@@ -204,10 +204,10 @@ class KeyframeEpisode(Episode):
         assert isinstance(twin, KeyframeEpisode) and twin.awaiting is not None
         newest = twin.awaiting.maps[-1]  # the others are not what this episode saw
         maps = (*self.remembered.maps, newest)
-        self.decided(BankState(maps[-self._policy.backbone.sizes.remembered :]))
+        self.decided(BankState(maps[-self.policy.backbone.sizes.remembered :]))
 
     def _scene_inputs(self, shots: list[Shot], finger: float, place: int) -> SceneInputs:
-        processor = self._policy.require_processor()
+        processor = self.policy.require_processor()
         points, colours = processor.cloud(shots)
         return SceneInputs(
             points, colours, processor.state(finger, place), processor.prompt(self.goal)

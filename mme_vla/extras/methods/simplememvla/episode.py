@@ -64,7 +64,7 @@ class VideoMemory:
 class VideoEpisode(Episode):
     """Recent frames of the memory camera beside the current view."""
 
-    _policy: "SimpleMemVlaPolicy"
+    policy: "SimpleMemVlaPolicy"
 
     def __init__(self, policy: "SimpleMemVlaPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
@@ -80,7 +80,7 @@ class VideoEpisode(Episode):
         states: np.ndarray | None = None,
     ) -> None:
         start = self.n_observed_frames
-        processor = self._policy.require_processor()
+        processor = self.policy.require_processor()
         oldest = start + len(demo) - 1
         if processor.shows_video:
             oldest -= processor.window.span
@@ -104,7 +104,7 @@ class VideoEpisode(Episode):
 
     def pairs(self, step: int) -> list[Pair]:
         """The temporal patches that are shown at a step."""
-        frames = self._policy.require_processor().frames(step).tolist()
+        frames = self.policy.require_processor().frames(step).tolist()
         return list(zip(frames[::2], frames[1::2], strict=True))
 
     def images_of(self, pairs: Sequence[Pair]) -> Tensor:
@@ -117,7 +117,7 @@ class VideoEpisode(Episode):
                 " observed: observe() those that frames_read() names."
             )
         frames = torch.stack([self.video.frames[frame] for frame in numbers])
-        return self._policy.require_processor().video(frames)
+        return self.policy.require_processor().video(frames)
 
     def encode(self, model: VideoLanguageModel, pairs: Sequence[Pair]) -> Tensor:
         """The tokens [n, m, D] of temporal patches; those read before are kept."""
