@@ -87,13 +87,13 @@ class TensorStruct:
         `nn.Module.to`, masks and integers keep their type.
         """
 
-        def moved(x: Tensor) -> Tensor:
+        def convert(x: Tensor) -> Tensor:
             y = x.to(*args, **kwargs)
             if x.is_floating_point() or y.dtype == x.dtype:
                 return y
             return x.to(y.device)
 
-        return self._map(moved)
+        return self._map(convert)
 
     def sent(self, device: torch.device) -> Self:
         """Return a copy on a device, made without waiting: see `send`."""

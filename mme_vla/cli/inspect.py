@@ -12,9 +12,13 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.table import Table
 
 from mme_vla.backbone.building import shape_of
+from mme_vla.cli.inspect_checkpoint import (
+    print_table,
+    show_checkpoint,
+    titled_table,
+)
 from mme_vla.cli.loading import words_of
 from mme_vla.config.devices import find_device
 from mme_vla.config.sections import PathText, PositiveInt, read_section, without
@@ -28,7 +32,6 @@ from mme_vla.data.robot_draft import CHECK, draft_robot, save_draft
 from mme_vla.data.sources import default_val_episodes, held_out_in, listed_sources
 from mme_vla.data.statistics import normalised_states
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.embodiment.action_space import numbered
 from mme_vla.errors import UserError, counted, printable, require
 from mme_vla.evaluation.records import display_name
 from mme_vla.memory.base import Memory
@@ -36,7 +39,7 @@ from mme_vla.memory.history import History, OnlineHistory, TokenlessHistory
 from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
-from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint, shipped_name
+from mme_vla.policy.run_folders import STATE, resolve_checkpoint, shipped_name
 from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.self_check import NO_CHECK, compare
 from mme_vla.training.checkpoint import read_state
@@ -48,9 +51,7 @@ from mme_vla.training.open_loop import (
     open_loop,
     plot_open_loop,
 )
-from mme_vla.training.runs import SUMMARY
 from mme_vla.training.settings import DataSettings
-from mme_vla.utils import read_json
 
 
 @dataclass(frozen=True)
@@ -306,160 +307,13 @@ def show_unknown_robot(dataset: str, robot: Embodiment, output: Path, console: C
     return True
 
 
-def show_checkpoint(
-    folder: Path, console: Console, trust_plugins: bool = False, everything: bool = False
-) -> None:
-    """Print a summary of a checkpoint: robot, memory, budget, data, steps and error.
-
-    Args:
-        folder: of a checkpoint or a run.
-        trust_plugins: import the modules that the checkpoint names.
-        everything: print its whole configuration and its statistics too.
-    """
-    folder = resolve_checkpoint(folder)
-    policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)
-    console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
-    state = read_state(folder) if (folder / STATE).is_file() else None
-    grid = Table.grid(padding=(0, 2))
-    for row in [*summary_rows(policy), *training_rows(policy, folder, state)]:
-        grid.add_row(*map(printable, row))
-    console.print(grid, highlight=False)
-    if everything:
-        show_details(policy, state, console)
-    else:
-        console.print("all=true shows the whole configuration and the statistics", style="dim")
-
-
-def summary_rows(policy: Policy) -> list[tuple[str, str]]:
-    """What a policy is, a title and a text each."""
-    sections = PolicySections.of(policy.config)
-    robot = policy.embodiment
-    space = robot.action
-    parts: dict[str, int] = {}
-    dtypes: dict[str, None] = {}  # in order, each once
-    for name, parameter in policy.named_parameters():
-        part = policy.finetune_spec.component_of(name)
-        parts[part] = parts.get(part, 0) + parameter.numel()
-        dtypes[str(parameter.dtype).removeprefix("torch.")] = None
-    sizes = ", ".join(f"{part} {count:,}" for part, count in parts.items())
-    names = [str(sections.name or "policy"), str(sections.backbone.get("name", "pi05"))]
-    rate = "any rate" if robot.fps is None else f"{robot.fps:g} frames per second"
-    relative = f"{len(space.relative)} of them relative to the state"
-    if space.of_pose:
-        relative = f"{len(space.of_pose)} of them differences to the tool's pose"
-    memory = "none"
-    if policy.memory is not None:
-        budget = counted(policy.memory.budget, "token") if policy.memory.budget else "no tokens"
-        parts_of = [str(sections.memory.get("name", "memory")), budget]
-        parts_of.append(f"of the camera {robot.memory_camera}")
-        parts_of.append(f"integration {sections.integration.get('name', 'none')}")
-        memory = ", ".join(parts_of)
-    return [
-        ("model", f"{names[0]}, backbone {names[1]} ({type(policy).__name__})"),
-        ("parameters", f"{sum(parts.values()):,} ({', '.join(dtypes)}): {sizes}"),
-        ("robot", f"{robot.name}: cameras {', '.join(robot.camera_names)}, {rate}"),
-        ("state", counted(robot.state.width, "number")),
-        ("action", f"{counted(space.width, 'number')}, {relative}"),
-        ("chunk", f"{space.horizon} actions, of which {space.execute} are executed"),
-        ("memory", memory),
-        ("text", policy.require_processor().prompt_spec.encoder),
-    ]
-
-
-def training_rows(
-    policy: Policy, folder: Path, state: Mapping[str, Any] | None
-) -> list[tuple[str, str]]:
-    """What is known of a checkpoint's training: data, steps, and errors.
-
-    state: of the training, where the checkpoint has it.
-    """
-    card = PolicySections.of(policy.config).card
-    known = str(card.get("data") or "not recorded")
-    steps = _summary(card.get("recipe") or "not recorded")
-    if state is not None:
-        data = state["config"].get("data", {})
-        train = state["config"].get("train", {})
-        known = ", ".join(entry.short_name for entry in listed_sources(data.get("sources")))
-        steps = f"{state['step']:,} of {train.get('steps', 0):,} updates"
-        steps += f", batches of {train.get('batch_size')}, learning rate {train.get('lr')}"
-        steps += f", seed {state['config'].get('seed')}"
-    if action_offset_of(policy):
-        known += f", action_offset={action_offset_of(policy)}"
-    error = _summary(card.get("results") or "not recorded")
-    rows = [("data", known), ("training", steps), ("error", error)]
-    check = _open_loop_of(folder)
-    if check is not None:
-        rows.append(("open loop", f"{check.get('episode', 'an episode')}. {check['verdict']}"))
-    else:
-        rows.append(
-            ("open loop", "not recorded; mme-vla inspect checkpoint=… dataset=… compares actions")
-        )
-    return rows
-
-
-def _open_loop_of(folder: Path) -> Mapping[str, Any] | None:
-    """The open-loop check of a finished run, if this is its last checkpoint."""
-    if len(folder.parents) < 2:
-        return None
-    path = folder.parents[1] / SUMMARY
-    if folder.parent.name != CHECKPOINTS or not path.is_file():
-        return None
-    summary = read_json(path, "the summary of a run")
-    check = summary.get("open_loop")
-    is_last = Path(str(summary.get("checkpoint", ""))).name == folder.name
-    if not is_last or not isinstance(check, Mapping) or "verdict" not in check:
-        return None
-    return check
-
-
-def show_details(policy: Policy, state: Mapping[str, Any] | None, console: Console) -> None:
-    """Print a checkpoint's whole configuration, training state and statistics."""
-    settings = _table("configuration", "section", "values")
-    for name, section in policy.config.items():
-        settings.add_row(name, _summary(section))
-    if state is not None:
-        settings.add_row(
-            "trained for",
-            f"{counted(state['step'], 'step')}; weights here are averages, raw ones beside them",
-        )
-        settings.add_row("recipe", _summary(state["config"].get("train", {})))
-        settings.add_row("data", _summary(state["config"].get("data", {})))
-        settings.add_row("versions", _summary(state["versions"]))
-    _show(settings, console)
-    stats = policy.require_processor().stats
-    if stats is not None:
-        space = policy.embodiment.action
-        action = "action delta" if space.relative or space.of_pose else "action"
-        for title, of, names in (
-            ("state", stats.state, state_names(policy.embodiment)),
-            (action, stats.actions, space.names),
-        ):
-            # Extremes are kept where a policy normalises by them.
-            bounds = {}
-            for bound in ("min", "q01", "q99", "max"):
-                if getattr(of, bound) is not None:
-                    bounds[bound] = getattr(of, bound)
-            numbers = _table(f"normalisation of the {title}", "number", *bounds)
-            for i, name in enumerate(names):
-                numbers.add_row(name, *(f"{values[i]:.3f}" for values in bounds.values()))
-            _show(numbers, console)
-
-
-def state_names(robot: Embodiment) -> tuple[str, ...]:
-    """Names of the state's numbers: the action's where an action is relative to them."""
-    names = list(numbered(robot.state.width))
-    for place in robot.action.relative:
-        names[place] = robot.action.names[place]
-    return tuple(names)
-
-
 MOST_EPISODES = 40  # in the table of a dataset
 
 
 def show_dataset(source: EpisodeSource, console: Console) -> None:
     """Print a dataset's episodes, at most `MOST_EPISODES` of them, and its totals."""
     compared = source.verify()
-    table = _table(
+    table = titled_table(
         f"{source.name} ({source.root})",
         "episode",
         "task",
@@ -485,7 +339,7 @@ def show_dataset(source: EpisodeSource, console: Console) -> None:
     table.add_row(
         "all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold"
     )
-    _show(table, console)
+    print_table(table, console)
     subgoals = printable(", ".join(source.subgoal_names)) or "none"
     console.print(
         f"{frames - video} execution steps to train on · {source.fps:g} frames per second · images"
@@ -511,7 +365,7 @@ def show_episode(source: EpisodeSource, episode: int, step: int, console: Consol
     """Print an episode's phases, and what is recorded at one step."""
     start = int(source.exec_starts[episode])
     length = int(source.lengths[episode])
-    table = _table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
+    table = titled_table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
     table.add_row("task", printable(source.task(episode)))
     table.add_row("goal", printable(source.goal(episode, step)))
     table.add_row("video", f"frames 0 … {start - 1}" if start else "none")
@@ -522,7 +376,7 @@ def show_episode(source: EpisodeSource, episode: int, step: int, console: Consol
     table.add_row(
         "action", _numbers(source.actions(episode, step, step + 1)[0], source.robot.action.names)
     )
-    _show(table, console)
+    print_table(table, console)
 
 
 def check_place(source: EpisodeSource, episode: int, step: int | None) -> tuple[int, int]:
@@ -571,7 +425,7 @@ def draw_memory(
         history = TokenlessHistory(filled)
     selected = memory.select(history, step)
     remembered = np.unique(selected[:, 0])
-    table = _table(f"{name} at step {step}", "", "")
+    table = titled_table(f"{name} at step {step}", "", "")
     table.add_row(
         "remembers",
         f"{len(selected)} of {counted(memory.capacity, 'token')}, in {len(remembered)} of"
@@ -582,7 +436,7 @@ def draw_memory(
         "stored",
         f"{counted(len(stored), 'frame')} of {memory.storage.grid}×{memory.storage.grid} tokens",
     )
-    _show(table, console)
+    print_table(table, console)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
     title = (
@@ -591,33 +445,6 @@ def draw_memory(
     )
     memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
     return path
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=printable(title), show_header=any(columns))
-    for i, column in enumerate(columns):
-        table.add_column(
-            column,
-            justify="left" if i == 0 or column in ("goal", "values", "task", "") else "right",
-        )
-    return table
-
-
-def _show(table: Table, console: Console) -> None:
-    """Print a table under its title, which may be wider: a path is not broken."""
-    console.print(table.title, style="bold", markup=False, highlight=False, soft_wrap=True)
-    table.title = None
-    console.print(table)
-
-
-def _summary(value: Any) -> str:
-    if isinstance(value, dict):
-        parts = []
-        for key, inner in value.items():
-            text = _summary(inner)
-            parts.append(f"{key}={{{text}}}" if isinstance(inner, dict) else f"{key}={text}")
-        return ", ".join(parts)
-    return printable(str(value))
 
 
 def _numbers(values: np.ndarray, names: Sequence[str]) -> str:

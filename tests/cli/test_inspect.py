@@ -19,10 +19,10 @@ from mme_vla.cli.inspect import (
     draw_memory,
     held_out_episodes,
     main,
-    show_checkpoint,
     show_dataset,
     show_episode,
 )
+from mme_vla.cli.inspect_checkpoint import show_checkpoint
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource

@@ -158,7 +158,7 @@ def test_actions_are_those_of_the_policy_in_process(
     np.testing.assert_array_equal(actions, expected)
 
 
-def test_a_robot_of_ones_own_comes_from_a_folder(package: ModuleType, tmp_path: Path) -> None:
+def test_a_robot_comes_from_a_folder_of_yaml_files(package: ModuleType, tmp_path: Path) -> None:
     from lerobot.configs import FeatureType, PolicyFeature
 
     (tmp_path / "embodiment").mkdir()

@@ -19,7 +19,7 @@ from helpers.rollout_fakes import InlineEnvs, roll
 from helpers.scripted_env import SIZE, make_scripted_env
 from helpers.serving_fakes import Served, challenge
 from helpers.tiers import slow_or_nightly
-from mme_vla.cli.inspect import show_checkpoint
+from mme_vla.cli.inspect_checkpoint import show_checkpoint
 from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
