@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from helpers import commands
@@ -124,6 +125,7 @@ def test_options_may_stand_anywhere(
     words: list[str], tree: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["app", *words])
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # taken back at the end
     run_configured("demo", lambda cfg: None, tree)
     printed = capfd.readouterr().out
     assert "seed: 5" in printed and "lr: 2" in printed

@@ -296,8 +296,8 @@ def images_of_the_body() -> tuple[np.ndarray, int]:
     images = []
     for qpos in (task.qpos, FACING_THE_CAMERA):
         task.agent.robot.set_qpos(qpos[None])
-        frame = env._observer.frame({})
+        frame = env._run.observer.frame({})
         images.append(np.stack([frame["front_rgb"], frame["wrist_rgb"]]))
-    n_pixels = int((env._observer.segmentation() == body).sum())
+    n_pixels = int((env._run.observer.segmentation() == body).sum())
     env.close()
     return np.stack(images), n_pixels
