@@ -77,13 +77,11 @@ class Claim:
     records: name of the file that the process holds and writes its records to; None gives the
         episode back.
     host, process: of the writer, for file systems without locks.
-    gave_up: whether the process's last try of the episode ended in an error.
     """
 
     records: str | None
     host: str = field(default_factory=socket.gethostname)
     process: PositiveInt = field(default_factory=os.getpid)
-    gave_up: bool = False
 
     def __post_init__(self) -> None:
         if self.records is not None and not _RECORDS.fullmatch(self.records):
@@ -98,8 +96,7 @@ class Claims:
     `claims/<task>-<episode>.<n>.json` is claim number n on an episode. Each is created exclusively
     and never changed or removed, so that two processes never hold the same one, on network file
     systems too. The newest claim counts. It holds while its process locks its file of records, and
-    where that file has the episode's result. One that gave up holds for the processes that were
-    alive then: those of a repeated command try the episode again.
+    where that file has the episode's result.
     """
 
     def __init__(self, folder: Path, records: str) -> None:
@@ -125,8 +122,6 @@ class Claims:
         for key, (number, claim) in list(self._newest.items()):
             if claim.records == records and key not in done:
                 self._create(key, number + 1, Claim(None))
-            elif claim.gave_up and not _is_locked(folder / str(claim.records), claim):
-                self._newest[key] = number, Claim(None)
 
     def take(self, waiting: Sequence[Job]) -> Job | None:
         """Claim the first episode that no process runs or has finished; None where all
@@ -143,14 +138,6 @@ class Claims:
                     return job
         return None
 
-    def give_up(self, job: Job) -> None:
-        """Have no other process that is alive take an episode of this one, whose last try ended in
-        an error.
-        """
-        key = EpisodeKey(job.task, job.episode)
-        number, _ = self._newest[key]
-        self._create(key, number + 1, Claim(self.records, gave_up=True))
-
     def _holds(
         self, claim: Claim, key: EpisodeKey, finished_by: dict[str, set[EpisodeKey] | None]
     ) -> bool:
@@ -158,8 +145,8 @@ class Claims:
         the episode.
         """
         records = claim.records
-        if records is None or claim.gave_up:
-            return claim.gave_up
+        if records is None:
+            return False
         if records not in finished_by:
             path = self.folder / records
             is_running = records == self.records or _is_locked(path, claim)
@@ -246,8 +233,3 @@ class Waiting:
     def put_back(self, job: Job) -> None:
         """Have an episode run once more, by this process."""
         self._again.append(job)
-
-    def give_up(self, job: Job) -> None:
-        """Have no process run an episode again, until the command is repeated."""
-        if self._claims is not None:
-            self._claims.give_up(job)

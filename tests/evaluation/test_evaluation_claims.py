@@ -139,25 +139,6 @@ def test_a_restarted_process_gives_back_its_unfinished_episodes(tmp_path: Path) 
         assert [taken(other.take(JOBS)) for _ in range(2)] == [1, 2]
 
 
-def test_an_episode_that_failed_for_good_is_run_again_by_a_repeated_command_alone(
-    tmp_path: Path,
-) -> None:
-    names = [f"episodes-{i}of3.jsonl" for i in range(3)]
-    with RecordLog(tmp_path / names[1]):
-        other = Claims(tmp_path, names[1])
-        with RecordLog(tmp_path / names[0]) as log:
-            first = Claims(tmp_path, names[0])
-            waiting = Waiting(JOBS[:1], first)
-            assert taken(waiting.take()) == 0
-            log.append(record(0, outcome="error"))
-            waiting.give_up(JOBS[0])
-            assert Claims(tmp_path, names[2]).take(JOBS[:1]) is None, "it began a little later"
-        assert other.take(JOBS[:1]) is None, "the first has ended, this one is alive"
-    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
-        again = [Claims(tmp_path, name) for name in names[:2]]
-        assert [taken(claims.take(JOBS[:1])) for claims in again[::-1]] == [0, None]
-
-
 def test_one_of_two_processes_takes_over_a_stale_claim(tmp_path: Path) -> None:
     with RecordLog(tmp_path / "episodes-0of3.jsonl"):
         Claims(tmp_path, "episodes-0of3.jsonl").take(JOBS[:1])

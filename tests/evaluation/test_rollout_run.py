@@ -2,7 +2,6 @@
 
 import signal
 import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -18,12 +17,12 @@ from helpers.rollout_fakes import (
     save_records,
     use_inline_envs,
 )
-from helpers.scripted_env import ScriptedEnv, make_mortal_env, make_moving_env
+from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, text_of
 from mme_vla.evaluation.claims import Claims, Shard, choose_shard
-from mme_vla.evaluation.records import EpisodeRecord, RecordLog, RunKey
+from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import Report
 from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, default_output
 from mme_vla.evaluation.rollout.progress import RolloutProgress
@@ -101,27 +100,6 @@ def test_a_dying_worker_is_an_error_that_is_tried_again(
     resumed = run_evaluation(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
     assert {record.outcome for record in resumed.records} == {"timeout"}
     assert outcomes(tmp_path / "b").items() <= outcomes(tmp_path / "a").items()
-
-
-@pytest.mark.parametrize("retries", [0, 2])
-def test_another_shard_does_not_take_an_episode_whose_every_try_failed(
-    retries: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    use_inline_envs(monkeypatch)
-    monkeypatch.setattr(
-        ScriptedEnv, "step", lambda self, action: (self._lists([self._frame()]), 0.0, True, False,
-                                                   {**self._info("error"), "error_message": "no"})
-    )  # fmt: skip
-    names = [f"episodes-{i}of2.jsonl" for i in range(2)]
-    settings = RolloutSettings(max_steps=16, workers=1, max_batch=1, retries=retries)
-    options = RunOptions(base=make_moving_env, show_progress=False, shard=Shard(0, 2))
-    with RecordLog(tmp_path / names[1]):
-        other = Claims(tmp_path, names[1])
-        EvaluationRun(quick_policy("pi05"), JOBS[:2], tmp_path, FACTS, settings, options).run()
-        tries = Counter(record.key for record in read_records(tmp_path / names[0]))
-        assert list(tries.values()) == [retries + 1] * 2
-        assert other.take(JOBS[:2]) is None
-    assert Claims(tmp_path, names[0]).take(JOBS[:2]) == JOBS[0], "the command was repeated"
 
 
 def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(

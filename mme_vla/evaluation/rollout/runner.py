@@ -305,8 +305,6 @@ class Rollout:
         self.on_end(running, Ending(outcome, error, again))
         if again:
             self._waiting.put_back(running.job)
-        elif outcome == "error":
-            self._waiting.give_up(running.job)
         del self._running[running.worker]
         self._start(running.worker)
 
