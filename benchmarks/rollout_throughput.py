@@ -18,7 +18,7 @@ from timing import machine
 
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
-from mme_vla.evaluation.rollout.environment import EpisodeFactory, Report
+from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
@@ -76,7 +76,7 @@ def measure(
     make = EpisodeFactory(policy.embodiment, render=not args.no_render)
     facts = RunKey(args.model, "untrained", settings.seed)
     records: list[EpisodeRecord] = []
-    with VecEnv([], workers, make, failure_info=Report.of_failure) as envs:
+    with VecEnv([], workers, make) as envs:
         short = [Job("StopCube", "test", 40 + worker) for worker in range(workers)]
         Rollout(policy, envs, facts, settings, lambda record: None).run(short)
         rollout = Rollout(policy, envs, facts, settings, records.append)

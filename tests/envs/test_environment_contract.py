@@ -26,7 +26,7 @@ from mme_vla.errors import UserError, place_of, set_place, text_of
 from mme_vla.evaluation.records import EpisodeRecord, check_settings
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.tables import grouping_tables
-from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv, Report
+from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv
 from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.registry import ENVS
@@ -362,7 +362,7 @@ class Failing(InlineEnvs):
         if error is None:
             super().start(worker, job, **how)
         else:
-            self._replies.append(Reply.of_failure(worker, job, True, error, Report.of_failure))
+            self._replies.append(Reply.of_failure(worker, job, True, error))
 
 
 def _roll(errors: list[Exception | None], retries: int = 0) -> list[EpisodeRecord]:

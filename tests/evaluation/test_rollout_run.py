@@ -20,13 +20,12 @@ from helpers.rollout_fakes import (
 from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import SceneError, text_of
+from mme_vla.errors import SceneError
 from mme_vla.evaluation.claims import Claims, Shard, choose_shard
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import Report
 from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, default_output
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
@@ -83,13 +82,8 @@ def test_a_dying_worker_is_an_error_that_is_tried_again(
     policy = quick_policy("pi05")
     (tmp_path / "graves").mkdir()
     monkeypatch.setenv("GRAVES", str(tmp_path / "graves"))
-    replies: list[Reply] = []
-    monkeypatch.setattr(Rollout, "on_reply", lambda self, running, reply: replies.append(reply))
     at_once = run_evaluation(policy, tmp_path / "a", make_mortal_env, jobs=JOBS[1:3])
     records = read_records(tmp_path / "a" / "episodes.jsonl")
-    assert replies and all(isinstance(reply.info, Report) for reply in replies)
-    (lost,) = [reply for reply in replies if reply.error is not None]
-    assert lost.done and lost.info.error == "PickXtimes test episode 1: " + text_of(lost.error)
     (error,) = [record for record in records if record.outcome == "error"]
     assert error.key == ("PickXtimes", 1) and "exit code 3" in error.error and error.steps == 16
     assert len(records) == 3 and {record.outcome for record in at_once.records} == {"timeout"}
@@ -179,8 +173,7 @@ def test_a_shard_comes_from_the_word_or_from_torchrun(monkeypatch: pytest.Monkey
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
         def start(self, worker, job, **how):
-            error = self.kind("no scene")
-            self._replies.append(Reply.of_failure(worker, job, True, error, Report.of_failure))
+            self._replies.append(Reply.of_failure(worker, job, True, self.kind("no scene")))
 
     envs = Broken(2)
     envs.kind = UserError

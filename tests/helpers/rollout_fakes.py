@@ -77,7 +77,7 @@ class InlineEnvs:
 def use_inline_envs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let an `EvaluationRun` step its environments in this process."""
 
-    def inline(jobs: Any, workers: int, factory: Any, *_: Any) -> InlineEnvs:
+    def inline(jobs: Any, workers: int, factory: Any, timeout: Any) -> InlineEnvs:
         envs = InlineEnvs(workers)
         envs.factory = factory
         return envs

@@ -58,8 +58,8 @@ class Reply:
     terminated: bool
     truncated: bool
     info: Any
-    """What the environment sends, and of the same type where a command failed: a dictionary, or the
-    `Report` of a rollout's environment.
+    """What the environment sends: a dictionary, or the `Report` of a rollout's environment. With an
+    `error` it is a dictionary of it.
     """
     error: Exception | None = None
     """Why there is no result of the policy: the environment raised it, or the worker died or hung
@@ -95,25 +95,15 @@ class Reply:
         return cls(worker, job, observation, reward, bool(terminated), bool(truncated), info)
 
     @classmethod
-    def of_failure(
-        cls,
-        worker: int,
-        job: Job,
-        resetting: bool,
-        error: Exception,
-        failure_info: Callable[[dict[str, str]], Any] = dict,
-    ) -> "Reply":
-        """Of a command that came to nothing; the message names the episode.
-
-        failure_info: see `VecEnv`.
-        """
-        values = {
+    def of_failure(cls, worker: int, job: Job, resetting: bool, error: Exception) -> "Reply":
+        """Of a command that came to nothing; the message names the episode."""
+        info = {
             "status": "error",
             "error_message": f"{job}: {text_of(error)}",
             "exception_type": type(error).__name__,
         }
         reward = None if resetting else 0.0
-        return cls(worker, job, None, reward, True, False, failure_info(values), error)
+        return cls(worker, job, None, reward, True, False, info, error)
 
 
 class WorkerCrash(RuntimeError):  # noqa: N818  (the name that records of crashes have)
@@ -151,8 +141,6 @@ class VecEnv:
         timeout: seconds after which a command without result counts as hung, and its worker is
             replaced. The wait of `recv`, and the outcome `timeout` of an episode (its step limit),
             are other things.
-        failure_info: makes the info of a reply without a result, of the type that the environments
-            send, from `status`, `error_message` and `exception_type`.
     """
 
     def __init__(
@@ -161,7 +149,6 @@ class VecEnv:
         workers: int,
         factory: Callable[..., Any] = make_env,
         timeout: float = 600.0,
-        failure_info: Callable[[dict[str, str]], Any] = dict,
     ) -> None:
         require(
             type(workers) is int and workers >= 1,
@@ -172,7 +159,6 @@ class VecEnv:
         """Episodes that no worker has begun yet."""
         self.timeout = timeout
         self._factory = factory
-        self._failure_info = failure_info
         self._context = simulating_processes()
         self._closed = False
         self._workers: list[_Worker] = []
@@ -318,7 +304,7 @@ class VecEnv:
                     return Reply.of_outcome(index, state.begun, state.resetting, content)
                 if isinstance(content, UserError | SceneError):
                     state.running = False
-                    return self._failed(index, state, content)
+                    return Reply.of_failure(index, state.begun, state.resetting, content)
                 # After any other error the process may be of no further use: a renderer that has
                 # lost its device fails until its process ends.
                 return self._replace(index, content)
@@ -338,10 +324,7 @@ class VecEnv:
         old.process.join(1.0)  # unless it hangs, it closes its environment and ends by itself
         protocol.end(old.process)
         self._workers[index] = self._spawn()
-        return self._failed(index, old, error)
-
-    def _failed(self, index: int, state: _Worker, error: Exception) -> Reply:
-        return Reply.of_failure(index, state.begun, state.resetting, error, self._failure_info)
+        return Reply.of_failure(index, old.begun, old.resetting, error)
 
     def _require_open(self) -> None:
         require(not self._closed, "The environments are closed; make new ones.")

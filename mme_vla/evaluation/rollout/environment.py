@@ -111,11 +111,6 @@ class Report:
     simulated_s: float = 0.0
     rendered_s: float = 0.0
 
-    @classmethod
-    def of_failure(cls, values: Mapping[str, str]) -> "Report":
-        """Of a command without a result (`VecEnv`)."""
-        return cls(status=values["status"], error=values["error_message"])
-
 
 @dataclass
 class StepOutcome:

@@ -24,7 +24,7 @@ from mme_vla.evaluation.records import (
     merge,
     read_records,
 )
-from mme_vla.evaluation.rollout.environment import EpisodeFactory, Report
+from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, Workload
@@ -430,7 +430,7 @@ class EvaluationRun:
             run=self.facts.label,
         )
         # It begins without jobs: `Waiting` hands them out.
-        return VecEnv([], workers, make, settings.timeout_s, Report.of_failure)
+        return VecEnv([], workers, make, settings.timeout_s)
 
 
 def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from mme_vla.envs.base import environment
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import SceneError, UserError
+from mme_vla.errors import SceneError, UserError, text_of
 from mme_vla.evaluation.claims import Waiting
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import ChunkCommand
@@ -207,7 +207,7 @@ class Rollout:
             message = running.report.error
         else:
             status = "error"
-            message = reply.info.error
+            message = f"{reply.job}: {text_of(reply.error)}"
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
         self._failures.note_end(reply, message, is_repeated=self._tries[running.job] > 1)

@@ -6,7 +6,7 @@ from typing import Any
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout.environment import ChunkEnv, Report
+from mme_vla.evaluation.rollout.environment import ChunkEnv
 
 
 class LocalEnvs:
@@ -63,7 +63,7 @@ class LocalEnvs:
         except UserError:
             raise
         except Exception as error:
-            reply = Reply.of_failure(worker, self._job, first, error, Report.of_failure)
+            reply = Reply.of_failure(worker, self._job, first, error)
         if reply.done:
             self._close()
         self._replies.append(reply)

@@ -170,7 +170,7 @@ def rollouts(
     )
     envs: VecEnv | LocalEnvs = LocalEnvs(make)
     if workers:
-        envs = VecEnv([], workers, make, run_settings.timeout_s, Report.of_failure)
+        envs = VecEnv([], workers, make, run_settings.timeout_s)
     collector = _Collector(policy, envs, run_settings, tuple(keep), oracle_share)
     with envs:
         for _ in collector.rounds(list(jobs)):
@@ -302,7 +302,7 @@ class _Collector(Rollout):
 
     def on_reply(self, running: RunningEpisode, reply: Reply) -> None:
         """Note the reward and what was executed of the last decision, and the oracle's next one."""
-        report = reply.info
+        report = Report() if reply.error else reply.info
         self._oracle[running] = report.oracle
         decisions = self._decisions[running]
         if reply.is_reset or not decisions:

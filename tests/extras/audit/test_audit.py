@@ -61,7 +61,7 @@ def settings(task: str = "Cues") -> RolloutSettings:
 class OneEnv(LocalEnvs):
     """A `VecEnv` of one environment in this process."""
 
-    def __init__(self, jobs: Any, workers: int, make: Any, *_: Any) -> None:
+    def __init__(self, jobs: Any, workers: int, make: Any, timeout: Any) -> None:
         super().__init__(make)
 
 
