@@ -19,13 +19,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, brief
-from mme_vla.evaluation.records import (
-    EpisodeRecord,
-    complete_compositions,
-    count_outcomes,
-    merge,
-    read_records,
-)
+from mme_vla.evaluation.records import EpisodeRecord, count_outcomes, read_records
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.store import RUN_FILE, read_run
 from mme_vla.policy.base import Policy
@@ -306,8 +300,12 @@ def _score(
         split = file_sum(Path(split))
     seeds: dict[str, list[Any]] = {}
     scenes: dict[str, str] = {}
+    ended: dict[str, EpisodeRecord] = {}
     for record in records:
         name = f"{record.task} {record.episode}"
+        # The first try that ended by itself counts, else the last one.
+        if name not in ended or ended[name].outcome == "error":
+            ended[name] = record
         seeds[name] = [record.seed, record.difficulty]
         if record.scene:
             scenes[name] = record.scene
@@ -315,7 +313,7 @@ def _score(
         "records": {"file": path.name.removesuffix(".xz"), "sha256": digest_of_file},
         "scenes": digest({"split": split, "scenes": seeds}, 64),
         "scene_digests": scenes,
-        "score": _outcomes(merge(complete_compositions(records), "first")),
+        "score": _outcomes(list(ended.values())),
     }
 
 

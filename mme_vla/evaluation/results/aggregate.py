@@ -286,7 +286,8 @@ def aggregate(
     _check_environments(included)
     check_settings(included)
     table = record_table(included)
-    table["method"] = table["run"].map(_method_key)
+    keys = {run: _method_key(run) for run in set(table["run"])}
+    table["method"] = [keys[run] for run in table["run"]]
     by_method = table.groupby("method", sort=False)
     methods = [_method(key, members, protocol) for key, members in by_method]
     methods.sort(key=lambda method: is_standing(method.key.model))  # last in every table
@@ -316,14 +317,13 @@ def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[in
     An episode whose records are not of the same scene was not repeated, nor one whose record was
     copied.
     """
-    distinct: dict[str, EpisodeRecord] = {}
-    for record in records:
-        if record.outcome != "error":
-            distinct[record.to_json()] = record
-    table = record_table(list(distinct.values()))
+    table = record_table([record for record in records if record.outcome != "error"])
     counts: dict[RunKey, tuple[int, int]] = {}
     for (run, _, _), members in table.groupby(["run", "task", "episode"], sort=False):
-        if len(members) < 2 or not pair([{0: list(members["record"])}]).keys:
+        if len(members) < 2:
+            continue
+        distinct = {record.to_json(): record for record in members["record"]}
+        if len(distinct) < 2 or not pair([{0: list(distinct.values())}]).keys:
             continue
         repeated, flipped = counts.get(run, (0, 0))
         flipped += int(members["outcome"].nunique() > 1)
