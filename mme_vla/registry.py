@@ -8,7 +8,7 @@ import importlib
 import inspect
 import pkgutil
 import re
-import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -240,16 +240,22 @@ class Registry[T]:
                 holder = f"is taken by {module}"
                 if name in self._core:
                     holder = f"ships with the library ({module})"
-                is_known = module in (None, mine)
+                require(
+                    module in (None, mine),
+                    f"{self.kind} {name!r} {holder}; choose another name in {mine}.",
+                )
             else:
-                holder = f"is already registered by {taken!r}"
-                # A module imported twice (once as __main__) registers an equal twin.
-                names = [getattr(one, "__qualname__", None) for one in (taken, entry)]
-                modules = [str(getattr(taken, "__module__", None)), mine]
-                files = [getattr(sys.modules.get(one), "__file__", one) for one in modules]
-                is_same = files[0] == files[1] or "__main__" in modules
-                is_known = names[0] == names[1] and is_same
-            require(is_known, f"{self.kind} {name!r} {holder}; choose another name in {mine}.")
+                # A module imported twice registers an equal twin.
+                require(
+                    getattr(taken, "__qualname__", None) == getattr(entry, "__qualname__", None),
+                    f"{self.kind} {name!r} is already registered by {taken!r}; choose another name"
+                    f" in {mine}.",
+                )
+                former = getattr(taken, "__module__", mine)
+                if former != mine and "__main__" not in (former, mine):
+                    warnings.warn(
+                        f"{self.kind} {name!r} of {mine} replaces that of {former}.", stacklevel=2
+                    )
             self._entries[name] = entry
             return entry
 

@@ -150,11 +150,10 @@ def run(args: argparse.Namespace) -> None:
         is_silent = path.is_dir() and not any(f.stat().st_size for f in find_records([path]))
         if is_silent or not records:
             silent.append(str(path))
-    require(
-        not silent,
-        f"{', '.join(silent)}: no episode has ended there yet, so there is nothing to show. Leave"
-        " it out, or continue its evaluation.",
-    )
+    message = f"{', '.join(silent)}: no episode has ended there yet"
+    require(bool(records), f"{message}, so there is nothing to show. Continue the evaluation.")
+    if silent:
+        print(f"{message}. The results are those of the others.", file=sys.stderr)
     protocol = _protocol(records, args)
     if args.title is None:
         is_benchmark = any(task in TASK_FACTS for task in protocol.tasks)

@@ -186,7 +186,12 @@ def _words(schema: _Schema, root: _Schema) -> str:
             items = [_words(item, root) for item in one["prefixItems"]]
             words = f"a list of {len(items)} values: {', '.join(items)}"
         elif one.get("items"):
-            words = f"a list, each {_words(one['items'], root)}"
+            count = ""
+            if "maxItems" in one:
+                count = f" of {one.get('minItems', 0)} to {one['maxItems']} values"
+            elif "minItems" in one:
+                count = f" of {one['minItems']} or more values"
+            words = f"a list{count}, each {_words(one['items'], root)}"
         elif "minimum" in one and "maximum" in one:
             words += f" from {one['minimum']} to {one['maximum']}"
         else:

@@ -31,7 +31,7 @@ def test_a_name_is_taken_once() -> None:
         register("memory", "tokendrop")(type("Mine", (), {}))
 
 
-def test_a_class_of_the_same_name_in_another_module_takes_no_name(
+def test_a_class_of_the_same_name_in_another_module_replaces_the_first_with_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = (
@@ -42,8 +42,9 @@ def test_a_class_of_the_same_name_in_another_module_takes_no_name(
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(REGISTRIES["reward"], "_entries", {})
     first = importlib.import_module("first_rewards")
-    with pytest.raises(UserError, match=r"<class 'first_rewards\.Mine'>; .* in second_rewards\."):
+    with pytest.warns(UserWarning, match="'of_mine' of second_rewards replaces that of first_rew"):
         importlib.import_module("second_rewards")
+    monkeypatch.setattr(REGISTRIES["reward"], "_entries", {"of_mine": first.Mine})
     importlib.reload(first)
     runpy.run_path(str(tmp_path / "first_rewards.py"), run_name="__main__")
 

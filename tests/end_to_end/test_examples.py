@@ -183,7 +183,7 @@ def installed(tmp_path: Path) -> str:
 def test_the_shortest_method_is_short_and_the_page_shows_its_names() -> None:
     files = sorted((METHOD / "one_layer").glob("*.py"))
     texts = [file.read_text() for file in files]
-    assert sum(len(text.splitlines()) for text in texts) <= 70
+    assert sum(len(text.splitlines()) for text in texts) <= 75
     page = (REPOSITORY / "docs" / "extend" / "add-a-method.md").read_text()
     snippet = (METHOD / "one_layer" / "extension.py").read_text().partition("from pathlib")[2]
     assert f"from pathlib{snippet}" in page
@@ -194,7 +194,10 @@ def test_the_shortest_method_is_short_and_the_page_shows_its_names() -> None:
 @pytest.mark.slow
 def test_the_shortest_method_and_its_command_work(installed: str, tmp_path: Path) -> None:
     env = {"PYTHONPATH": installed, "OMP_NUM_THREADS": "1"}
-    for words in (("train", "model=one_layer", *BRIEF, "output=run"), ("one-layer", "run")):
+    for words in (
+        ("train", "model=one_layer", *BRIEF, "output=run"),
+        ("one-layer", "run", "--trust-plugins"),
+    ):
         done = commands.run("mme_vla", *words, cwd=tmp_path, env=env)
         assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout == "66,560 weights\n"

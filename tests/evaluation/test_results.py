@@ -556,10 +556,14 @@ def test_a_run_without_an_ended_episode_is_named(
     save_records(empty, [])
     save_records(tmp_path / "there", [EpisodeRecord("m", 1, 7, "BinFill", 0, 0, "easy", "fail", 9)])
     there = str(tmp_path / "there")
-    for words in ([str(empty)], [str(empty.parent)], [there, str(empty.parent)]):
+    for silent in (str(empty), str(empty.parent)):
         with pytest.raises(SystemExit):
-            main([*words, "--brief"])
-        assert f"{words[-1]}: no episode has ended there yet" in capsys.readouterr().err
+            main([silent, "--brief"])
+        assert f"{silent}: no episode has ended there yet, so" in capsys.readouterr().err
+    main([there, str(empty.parent), "--brief"])
+    printed = capsys.readouterr()
+    assert f"{empty.parent}: no episode has ended there yet" in printed.err
+    assert "BinFill" in printed.out
     main([there, str(empty), "--brief"])  # as a shell lists the files of shards
     assert "BinFill" in capsys.readouterr().out
 

@@ -28,6 +28,8 @@ class Outer(BaseModel):
     kind: Literal["simple", "grounded"] = "simple"
     count: Annotated[int, AfterValidator(even)] = 0
     inners: list[Inner] = []
+    some: Annotated[list[int], Field(min_length=1)] = [1]
+    few: Annotated[list[int], Field(min_length=1, max_length=2)] = [1]
     short: Annotated[str, Field(max_length=3)] = ""
     name: str = Field(alias="the/name", description="what it is called")
 
@@ -42,6 +44,8 @@ class Outer(BaseModel):
         ({"count": 3}, "count must be an even number, got 3."),
         ({"inners": [{"width": 1}, {"width": None}]}, "inners[1].width=None must be a whole"),
         ({"inners": [{}]}, "inners[0] lacks the key 'width'; it has none."),
+        ({"some": []}, "some=[] must be a list of 1 or more values, each a whole number."),
+        ({"few": [1, 2, 3]}, "few=[1, 2, 3] must be a list of 1 to 2 values, each a whole"),
         ({"short": "long"}, "short='long' must be a text of length 3 or less."),
         ({"stepz": 1}, "Unknown key stepz. Did you mean 'steps'?"),
         ({"the/name": 3}, "the/name=3 must be a text."),

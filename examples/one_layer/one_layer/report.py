@@ -1,10 +1,14 @@
 """The command `mme-vla one-layer CHECKPOINT`."""
 
-import sys
+import argparse
 
 from mme_vla import Policy
 
 
 def main():
-    layer = Policy.from_pretrained(sys.argv[1], trust_plugins=True).layer
+    parser = argparse.ArgumentParser(description="Count the weights of a checkpoint's layer.")
+    parser.add_argument("checkpoint")
+    parser.add_argument("--trust-plugins", action="store_true")
+    args = parser.parse_args()
+    layer = Policy.from_pretrained(args.checkpoint, trust_plugins=args.trust_plugins).layer
     print(f"{layer.weight.numel():,} weights")
