@@ -293,7 +293,9 @@ def check_chunks(batch: Batch, noise: Mapping[str, Tensor]) -> None:
     if batch.actions is None:
         raise ValueError("A loss needs the recorded chunks: Batch.actions is None.")
     chunks, random = list(batch.actions.shape), noise.get("noise")
-    if random is not None and list(random.shape) != chunks:
+    # A backbone may call other random numbers so, which are not added to a chunk.
+    is_added = random is not None and random.ndim == len(chunks)
+    if random is not None and is_added and list(random.shape) != chunks:
         raise ValueError(
             f"Batch.actions {chunks} and noise {list(random.shape)} differ in shape: pad actions"
             " with zeros to the network's, and give training_noise() the number of samples."

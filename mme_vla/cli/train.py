@@ -197,7 +197,7 @@ def _train(
         accelerator,
         facts={
             "card": {"data": run.data.name, "recipe": recipe(config)},
-            TRAINING: identify(config, data.content, data.side_files),
+            TRAINING: identify(config, data.content),
             "data": {"action_offset": run.data.action_offset},
         },
         name=run.name,

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 FLOAT32_PRODUCTS = ("ieee", "tf32")
 
 
-def find_device(name: str) -> "torch.device":
-    """The device of that name; `auto`: a GPU where there is one."""
+def find_device(name: "str | int | torch.device") -> "torch.device":
+    """The device of that name, or GPU of that number; `auto`: a GPU where there is one."""
     import torch
 
     if name == "auto":

@@ -232,11 +232,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         horizon = self.processor.embodiment.action.horizon
         if opened.robot.action.frames is None:
             # Not every motion has a decision here: some may not have been rendered.
-            full = []
-            for frame in decisions:
-                if opened.action_chunk(episode, int(frame), horizon)[1].all():
-                    full.append(frame)
-            return full
+            frames = np.asarray(decisions, np.int64)
+            return frames[opened.action_chunk(episode, frames, horizon)[1].all(-1)]
         last = int(opened.lengths[episode]) - horizon - self.action_offset
         return decisions[: bisect_right(decisions, last)]
 

@@ -190,7 +190,7 @@ def build_from_config(
         )
     if seed is None:
         seed = values.get("seed", 42)
-    target = find_device(str(device))
+    target = find_device(device)
     is_on_meta = target.type == "meta"
     # On meta the tokenizer is not needed.
     processor = None if is_on_meta else build_processor(sections)

@@ -88,9 +88,7 @@ class Episode:
                 self.history = OnlineHistory(memory.storage, scorer)
             self.stream = memory.start_stream()
             if memory.uses_proprio:
-                self.history.motion = lambda frames: torch.stack(
-                    [self._motion_of_frames[int(frame)] for frame in frames]
-                )
+                self.history.motion = self._motion_at
                 self.history.state_width = policy.embodiment.state.width
             if memory.past_view_spec is not None:
                 self._past = PastImages(memory.past_view_spec)
@@ -101,11 +99,15 @@ class Episode:
         self._executed = self._no_actions
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        memo[id(self.policy)] = self.policy
+        # What holds policy and episode is copied with both: the policy comes first there.
+        memo.setdefault(id(self.policy), self.policy)
         episode = object.__new__(type(self))
         memo[id(self)] = episode
         episode.__dict__.update(copy.deepcopy(self.__dict__, memo))
         return episode
+
+    def _motion_at(self, frames: Sequence[int] | np.ndarray) -> Tensor:
+        return torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
 
     def observe(
         self,

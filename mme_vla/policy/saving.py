@@ -280,7 +280,7 @@ def load_policy[P: "Policy"](
     """
     from mme_vla.processing.base import load_processor
 
-    place = find_device(str(device))
+    place = find_device(device)
     requested_dtype = None if dtype == "auto" else dtype_of(dtype)
     folder = local_folder(source, revision, token)
     require(

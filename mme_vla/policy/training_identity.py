@@ -61,7 +61,6 @@ class TrainingIdentity:
 def identify(
     config: Mapping[str, Any],
     content: Sequence[str],
-    side_files: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, Any]:
     """The identity of a training before it has weights, as plain values for the policy's
     configuration.
@@ -69,7 +68,6 @@ def identify(
     Args:
         config: the plain configuration of a training.
         content: fingerprints of its datasets.
-        side_files: digests of what is read beside them, of each dataset.
     """
     train = config.get("train") or {}
     policy = config.get("policy") or {}
@@ -90,13 +88,11 @@ def identify(
         # The weights to start from: their digest, or the end of their path or hub name.
         folder = newest_checkpoint(Path(source).expanduser())
         recipe["init_from"] = weights_digest(folder) or Path(source).name
-    split: dict[str, Any] = {
+    split = {
         "content": list(content),
         "val_fraction": data.get("val_fraction"),
         "val_episodes": data.get("val_episodes"),
     }
-    if any(side_files):
-        split["side_files"] = list(side_files)
     identity = TrainingIdentity(int(config["seed"]), digest(recipe, 12), digest(split, 12))
     return {key: value for key, value in asdict(identity).items() if value is not None}
 

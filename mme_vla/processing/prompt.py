@@ -251,7 +251,7 @@ STD_PER_LIMIT = 1 / 2.5  # the noise's standard deviation, as a share of where i
 
 @dataclass(frozen=True)
 class SubgoalText:
-    """Chooses the text of one training step, as released.
+    """Chooses the text of one training step, as released. `from_config` checks its values.
 
     kind: `simple_subgoal` or `grounded_subgoal`.
     online_probability: how often the label is the one the simulator reports at test time, which

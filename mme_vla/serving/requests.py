@@ -357,7 +357,7 @@ class RequestReader:
             )
         flags = validated(Flags, message, "The request")
         if flags.reset:
-            return validated(Reset, message, "The request")
+            return validated(Reset, {"seed": message.get("seed")}, "The request")
         if flags.add_buffer:
             return self._add_buffer(message)
         require(

@@ -67,22 +67,24 @@ class CapturedSampling:
         rows = len(tensors[0])
         capacity = 1 << (rows - 1).bit_length()
         key = (steps, capacity, *((tuple(x.shape[1:]), x.dtype) for x in tensors))
-        if key not in self._captured:
-            # The last row over and over where there are fewer.
-            full = inputs._map(
-                lambda x: torch.cat([x, x[-1:].expand(capacity - len(x), *x.shape[1:])])
-            )
-            self._captured[key] = self._capture(full, steps)
-        captured = self._captured[key]
-        for static, x in zip(captured.inputs.tensors(), tensors, strict=True):
-            static[:rows].copy_(x)
-        captured.graph.replay()
-        return captured.chunks[:rows].clone()
+        with torch.cuda.device(tensors[0].device):  # streams are those of the current GPU
+            if key not in self._captured:
+                # The last row over and over where there are fewer.
+                full = inputs._map(
+                    lambda x: torch.cat([x, x[-1:].expand(capacity - len(x), *x.shape[1:])])
+                )
+                self._captured[key] = self._capture(full, steps)
+            captured = self._captured[key]
+            for static, x in zip(captured.inputs.tensors(), tensors, strict=True):
+                static[:rows].copy_(x)
+            captured.graph.replay()
+            return captured.chunks[:rows].clone()
 
     def _capture(self, inputs: Inputs, steps: int) -> _Captured:
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
-        if self._stream is None:  # one for good: libraries keep workspaces for every stream
+        # One for good on each GPU: libraries keep workspaces for every stream.
+        if self._stream is None or self._stream.device_index != torch.cuda.current_device():
             self._stream = torch.cuda.Stream()
         # Libraries choose their kernels and take their workspaces (cuBLAS 32 MiB a stream) in a
         # first run, which no graph may hold: on the stream that all graphs are captured on, so that

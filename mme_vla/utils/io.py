@@ -123,13 +123,15 @@ def _reason(error: Exception) -> str:
 def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     """Around a call into another library that parses the file `path`, and nothing else.
 
-    Parsers of binary formats raise whatever they stumble over, from KeyError to MemoryError; there
-    is no list of it.
+    Parsers of binary formats raise whatever they stumble over; there is no list of it. A file that
+    may not be opened is not called damaged.
     """
     try:
         yield
     except UserError:
         raise
+    except PermissionError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}.") from error
     except Exception as error:
         # some wrap what happened in a sentence without content
         message = " ".join(str(error.__cause__ or error).split())

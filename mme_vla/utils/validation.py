@@ -185,13 +185,13 @@ def _words(schema: _Schema, root: _Schema) -> str:
         elif "prefixItems" in one:
             items = [_words(item, root) for item in one["prefixItems"]]
             words = f"a list of {len(items)} values: {', '.join(items)}"
-        elif one.get("items"):
-            count = ""
+        elif one.get("type") == "array":
             if "maxItems" in one:
-                count = f" of {one.get('minItems', 0)} to {one['maxItems']} values"
+                words += f" of {one.get('minItems', 0)} to {one['maxItems']} values"
             elif "minItems" in one:
-                count = f" of {one['minItems']} or more values"
-            words = f"a list{count}, each {_words(one['items'], root)}"
+                words += f" of {one['minItems']} or more values"
+            if one.get("items"):
+                words += f", each {_words(one['items'], root)}"
         elif "minimum" in one and "maximum" in one:
             words += f" from {one['minimum']} to {one['maximum']}"
         else:

@@ -247,19 +247,30 @@ def test_seed_of_an_episode_may_be_any_integer():
             policy.start_episode("go", seed)
 
 
-@pytest.mark.parametrize("model", ["framesamp_modul", "rmt_context"])
+@pytest.mark.parametrize(
+    "model", ["framesamp_modul", "rmt_context", "actions_modul", "spacetime_modul"]
+)
 def test_copies_of_an_episode_share_its_policy_and_nothing_else(model):
-    policy = small_policy(model, backbone=FEW_TOKENS, memory=MEMORY)
+    policy = small_policy(model, backbone=FEW_TOKENS)
     frames = moving_frames(5, size=policy.backbone.image_size)
     views = {"front": frames, "wrist": frames}
-    episode = policy.start_episode("press the button")
-    episode.observe(views, np.zeros((5, 8), np.float32))
+
+    def begun():
+        episode = policy.start_episode("press the button")
+        episode.observe(views, np.zeros((5, 8), np.float32))
+        return episode
+
+    def observed(episode):
+        episode.observe(views, np.ones((5, 8), np.float32))
+        return policy.act(episode)
+
+    episode = begun()
     branch = copy.deepcopy(episode)
     assert branch.policy is policy
-    first = policy.act(branch)
-    branch.observe(views, np.ones((5, 8), np.float32))
-    policy.act(branch)
-    assert (policy.act(episode) == first).all()
+    assert (observed(branch) == observed(begun())).all()
+    assert (policy.act(episode) == policy.act(begun())).all()
+    other, beside = copy.deepcopy([policy, episode])
+    assert beside.policy is other is not policy
 
 
 def test_an_episode_of_another_policy_is_refused():

@@ -76,7 +76,7 @@ class Keyframes(FrameMemory, PerceptualMemory, ReadsLabels):
         self.read = nn.Linear(2 * d_vision, hidden)
         self.write = nn.Linear(hidden, 1)
 
-    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int = 0) -> np.ndarray:
         """The frames that the head reads at `step`, ascending, the newest stored one among them;
         `forward` keeps some of them.
         """

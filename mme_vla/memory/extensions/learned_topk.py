@@ -96,7 +96,7 @@ class LearnedTopK(FrameMemory):
         self.score = nn.Linear(hidden, 1)
         self.encoder = FeatureEncoder(d_vision, width, **options)
 
-    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int = 0) -> np.ndarray:
         """The frames whose tokens compete at `step`; `forward` keeps some of the tokens."""
         return evenly_spaced_stored_frames(self.storage, step, self.pool)
 
