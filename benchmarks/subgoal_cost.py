@@ -25,7 +25,8 @@ from mme_vla.extras.probing.analyses.cost import count_model, flops
 from mme_vla.subgoal import Gemini, Memer, QwenVL
 from mme_vla.subgoal.finetuning.collecting import Demonstration, open_input
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes
-from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
+from mme_vla.subgoal.models.qwen3vl import VLM, Question
+from mme_vla.subgoal.models.replies import Reply
 from mme_vla.subgoal.text import mark_points, memer_reply, write_boxes
 
 TERA = 1e12
@@ -128,7 +129,7 @@ class CountingVLM:
     def __init__(self, tiny: VLM) -> None:
         self.tiny, self.next_reply, self.flops = tiny, "", 0
 
-    def generate(self, questions: Sequence[Question], max_new_tokens: int) -> list[Completion]:
+    def generate(self, questions: Sequence[Question], max_new_tokens: int) -> list[Reply]:
         (question,) = questions
         batch = self.tiny.encode([question])
         read = batch["input_ids"].shape[1]
@@ -139,7 +140,7 @@ class CountingVLM:
             ).tolist():
                 self.flops += vision_flops(height * width, time)
         self.flops += language_flops(-(-read // 16) * 16, n_output)
-        return [Completion(self.next_reply, read, n_output)]
+        return [Reply(self.next_reply, read, n_output)]
 
 
 class CountingClient:

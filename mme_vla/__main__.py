@@ -18,18 +18,20 @@ def main() -> None:
     if name in ("-V", "--version"):
         print(f"mme-vla {mme_vla.__version__}")
         return
+    is_help = name in ("-h", "--help")
     with print_user_errors():
         known = commands()
-        if name in ("-h", "--help"):
+        if is_help:
             width = max(map(len, known))
             lines = "\n".join(f"  {name:<{width}}  {of.text}" for name, of in known.items())
             print(
                 f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more"
                 " of one; mme-vla --version names the version."
             )
-            return
-        if name not in known:
+        elif name not in known:
             raise UserError(f"There is no command {name!r}. {did_you_mean(name, known)}")
+    if is_help:
+        return
     sys.argv = [f"mme-vla {name}", *words]
     run(name)
 

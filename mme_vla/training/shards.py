@@ -176,7 +176,9 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     """
     folder = checkpoint / SHARDS
     files = shard_files(checkpoint)
-    check_sums(checkpoint, shard_notes(checkpoint))
+    # Sharded checkpoints of earlier versions list no shards.
+    if any(name.startswith(f"{SHARDS}/") for name in Sums(checkpoint).table):
+        check_sums(checkpoint, shard_notes(checkpoint))
     sums: dict[Path, Sums] = {}
     for file in files:
         note = file.with_suffix(".sha256")

@@ -3,6 +3,7 @@ weights alone is kept.
 """
 
 import logging
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -121,6 +122,7 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         return graphs._Captured(replayed, inputs, replayed.chunks)  # type: ignore[arg-type]
 
     monkeypatch.setattr(CapturedSampling, "_capture", capture)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     return sizes
 
 
@@ -164,11 +166,8 @@ def test_a_command_compiles_what_it_is_requested() -> None:
         prepare_sampling(policy, "graph", logger)
 
 
-def test_no_length_or_size_of_batch_is_one_too_many_to_compile(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for name, default in (("recompile_limit", 8), ("accumulated_recompile_limit", 256)):
-        monkeypatch.setattr(torch._dynamo.config, name, default)
+@torch._dynamo.config.patch(recompile_limit=8, accumulated_recompile_limit=256)
+def test_no_length_or_size_of_batch_is_one_too_many_to_compile() -> None:
     policy = small_policy("pi05", **{"processor.prompt_length": 200}).eval()
     policy.processor = None
     policy.compile_sampling(layers=True)

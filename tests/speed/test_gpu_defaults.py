@@ -39,6 +39,7 @@ def test_weights_for_acting_are_rounded_where_they_may_be(
     )
     # there need be no GPU to see what would go there
     monkeypatch.setattr(MMEPolicy, "to", lambda self, device: self)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     there = MMEPolicy.from_pretrained(tmp_path, dtype="auto", device="cuda")
     assert {p.dtype for p in there.parameters()} == {torch.bfloat16}
     monkeypatch.setattr(MMEPolicy, "acts_in_bfloat16", DiffusionPolicy.acts_in_bfloat16)

@@ -92,6 +92,14 @@ def test_a_shard_that_was_replaced_with_its_checksum_is_refused(
         read_weights(checkpoint, policy)
 
 
+def test_shards_whose_checksums_an_earlier_version_did_not_list_are_read(
+    policy: MMEPolicy, checkpoint: Path
+) -> None:
+    (checkpoint / "config.json").write_text("{}")
+    write_sums(checkpoint, ["config.json"])
+    read_weights(checkpoint, policy)
+
+
 def test_damage_is_an_error_of_the_library_whatever_the_checksum_says(
     policy: MMEPolicy, checkpoint: Path
 ) -> None:
