@@ -123,8 +123,8 @@ def _reason(error: Exception) -> str:
 def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     """Around a call into another library that parses the file `path`, and nothing else.
 
-    Parsers of binary formats raise whatever they stumble over; there is no list of it. A file that
-    may not be opened is not called damaged.
+    Parsers of binary formats raise whatever they stumble over, MemoryError too; there is no list of
+    it. A file that may not be opened is not called damaged.
     """
     try:
         yield

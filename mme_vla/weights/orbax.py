@@ -16,6 +16,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,8 @@ def read_orbax(
         params.check()
     else:
         _check_files(params)
-    with decoding(str(params), "an Orbax checkpoint", _REMEDY):
+    parsing = partial(decoding, str(params), "an Orbax checkpoint", _REMEDY)
+    with parsing():
         # All are requested before the first is waited for, so that reading overlaps.
         pending = {}
         for path, (name, driver) in _list_arrays(ts, params).items():
@@ -142,8 +144,9 @@ def read_orbax(
                 f" {brief(tuple(store.shape))} would lie in pieces of {piece:,} numbers.",
             )
             shapes[name] = torch.empty(store.shape, device="meta")
-        if fits is not None:
-            fits(shapes)
+    if fits is not None:
+        fits(shapes)
+    with parsing():
         reads = {name: store.read() for name, store in stores.items()}
         tree = {}
         for name, read in reads.items():

@@ -94,6 +94,12 @@ def test_what_is_saved_reads_back(dtype: torch.dtype, tmp_path: Path) -> None:
     )
 
 
+def test_an_error_of_the_check_of_shapes_is_not_one_of_the_file(tmp_path: Path) -> None:
+    write_orbax({"a": torch.zeros(2)}, tmp_path / "params")
+    with pytest.raises(KeyError, match="absent"):
+        read_orbax(tmp_path / "params", fits=lambda shapes: shapes["absent"])
+
+
 def test_a_checkpoint_without_its_values_is_refused(tmp_path: Path) -> None:
     shutil.copytree(RUN, tmp_path / "run")
     largest = max((tmp_path / "run").glob("**/d/*"), key=lambda file: file.stat().st_size)
