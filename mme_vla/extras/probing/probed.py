@@ -34,11 +34,11 @@ class ProbedEpisode(Episode):
     subgoals: those that were set at each chunk so far.
     """
 
+    policy: "ProbedPolicy"
     recording: Recording | None = None
 
     def __init__(self, policy: "ProbedPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
-        self._probed = policy
         self.seed = seed
         self.inner = policy.inner.start_episode(goal, seed)
         self.exec_start: int | None = None
@@ -69,15 +69,15 @@ class ProbedEpisode(Episode):
         video = int(demo.sum())
         numbers = self.n_observed_frames + np.arange(length)
         if not self.n_observed_frames:
-            _show_all(self._probed.sessions, self.inner, self._probed.inner)
+            _show_all(self.policy.sessions, self.inner, self.policy.inner)
         if self.exec_start is None and video < length:
             self.exec_start = self.n_observed_frames + video
         self.n_observed_frames += length
 
         # How often each frame is observed; the one at which the policy decides always is.
         exec_start = self.n_observed_frames if self.exec_start is None else self.exec_start
-        repeats = self._probed.feed.repeats(numbers, exec_start)
-        if self._probed.feed.drops and video < length:
+        repeats = self.policy.feed.repeats(numbers, exec_start)
+        if self.policy.feed.drops and video < length:
             repeats[-1] = max(repeats[-1], 1)
         self._counts = np.concatenate([self._counts, repeats])
         order = np.repeat(np.arange(length), repeats)
@@ -100,7 +100,7 @@ class ProbedEpisode(Episode):
             views[name] = view
             if (repeats != 1).any():
                 views[name] = view[np.searchsorted(with_images, order[places[name]])]
-        if self._probed.arm.shows:
+        if self.policy.arm.shows:
             self._collect(views, states[order], demo[order], numbers[order], actions)
         elif rendered is None:
             self.inner.observe(views, states[order], demo[order], actions)
@@ -146,17 +146,17 @@ class ProbedEpisode(Episode):
 
     def show_collected(self) -> None:
         """Show the policy the frames that were collected, as the arm has them."""
-        arm = self._probed.arm
+        arm = self.policy.arm
         collected = self._collected
         if not arm.shows or collected is None:
             return
         before = self._before or {name: view[:0] for name, view in collected.views.items()}
-        shown = arm.show(replace(collected, before=before), self._probed.moment(self))
+        shown = arm.show(replace(collected, before=before), self.policy.moment(self))
         if arm.renews:
             # Another seed at each decision: the noise of one is not that of the others.
             if self._decisions:
                 self.inner.close()
-                self.inner = self._probed.inner.start_episode("", self.seed + self._decisions)
+                self.inner = self.policy.inner.start_episode("", self.seed + self._decisions)
             self.inner.options = self.options
         else:
             self._collected = None
@@ -186,7 +186,7 @@ class ProbedEpisode(Episode):
         observed.
         """
         frames = frames[frames < len(self._counts)]
-        last = self._probed.n_before + np.cumsum(self._counts)[frames] - 1
+        last = self.policy.n_before + np.cumsum(self._counts)[frames] - 1
         numbers: list[int] = last[self._counts[frames] > 0].tolist()
         return numbers
 

@@ -76,9 +76,10 @@ class RemoteProcessor(PolicyProcessor):
 class RemoteEpisode(Episode):
     """What is observed and not sent yet, and the connection of one episode."""
 
+    policy: "RemotePolicy"
+
     def __init__(self, policy: "RemotePolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
-        self._remote = policy
         self._seed = seed
         self._views: list[Mapping[str, Any]] = []
         self._states: list[np.ndarray] = []
@@ -172,7 +173,7 @@ class RemoteEpisode(Episode):
         connection = self.connection
         self.connection = None
         try:
-            self._remote.protocol.end(connection)
+            self.policy.protocol.end(connection)
         except (ConnectionError, UserError):
             return  # the server is gone, and with it the episode
         finally:
