@@ -292,13 +292,14 @@ def check_chunks(batch: Batch, noise: Mapping[str, Tensor]) -> None:
     """Raise an error unless a batch has recorded chunks, of the shape of its noise."""
     if batch.actions is None:
         raise ValueError("A loss needs the recorded chunks: Batch.actions is None.")
-    chunks, random = list(batch.actions.shape), noise.get("noise")
-    # A backbone may call other random numbers so, which are not added to a chunk.
-    is_added = random is not None and random.ndim == len(chunks)
-    if random is not None and is_added and list(random.shape) != chunks:
+    chunks = batch.actions
+    random = noise.get("noise")
+    # Of another number of dimensions they are added to no chunk: a backbone's own.
+    if random is not None and random.ndim == chunks.ndim and random.shape != chunks.shape:
+        shapes = f"{list(chunks.shape)} and noise {list(random.shape)}"
         raise ValueError(
-            f"Batch.actions {chunks} and noise {list(random.shape)} differ in shape: pad actions"
-            " with zeros to the network's, and give training_noise() the number of samples."
+            f"Batch.actions {shapes} differ in shape: pad actions with zeros to the network's, and"
+            " give training_noise() the number of samples."
         )
 
 
