@@ -124,7 +124,7 @@ def join_names[T](
             first, second = (getattr(one, "module", one) for one in (taken, entry))
             require(
                 taken == entry,
-                f"Two bring the {what} {name!r}: {owner} ({first}), and {extension.owner}"
+                f"Two packages define the {what} {name!r}: {owner} ({first}), and {extension.owner}"
                 f" ({second}). Rename it in one of them, or uninstall one.",
             )
     return joined

@@ -39,9 +39,9 @@ def library_trees() -> tuple[Path, ...]:
                 name = file.relative_to(tree)
                 require(
                     not (folder / name).exists(),
-                    f"Two bring the configuration {str(name)!r}: {owner} ({folder / name}), and"
-                    f" {extension.owner} ({file}). Rename the file in one of them, or uninstall"
-                    " one.",
+                    f"Two packages define the configuration {str(name)!r}: {owner}"
+                    f" ({folder / name}), and {extension.owner} ({file}). Rename the file in one"
+                    " of them, or uninstall one.",
                 )
         owners[tree] = extension.owner
     return tuple(owners)

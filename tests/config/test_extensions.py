@@ -176,8 +176,8 @@ def test_a_part_whose_name_is_taken_names_both_owners(
     plugin = "the installed plugin 'first' (first.names:EXTENSION) (first.part)"
     kind = registry.REGISTRIES[key].kind
     assert str(refused.value) == (
-        f"Two bring the {kind} {name!r}: {owner}, and {plugin}. Rename it in one of them, or"
-        " uninstall one."
+        f"Two packages define the {kind} {name!r}: {owner}, and {plugin}. Rename it in one"
+        " of them, or uninstall one."
     )
 
 
@@ -217,7 +217,10 @@ def test_commands_checkpoints_and_formats_whose_name_is_taken_name_both_owners(
         formats()
     with pytest.raises(SystemExit) as ended:
         main()
-    assert ended.value.code == 2 and "Two bring the command 'train'" in capsys.readouterr().err
+    assert (
+        ended.value.code == 2
+        and "Two packages define the command 'train'" in capsys.readouterr().err
+    )
 
 
 def test_a_yaml_file_whose_name_is_taken_names_both_files(
