@@ -59,7 +59,12 @@ def compute_norm_stats(
         exact: quantiles of all rows at once (linear interpolation), not of their histogram.
         video: count the conditioning video's steps too.
         narrow: what to do about a number whose range the values leave by far (`check_ranges`).
+
+    Raises:
+        UserError: `narrow` is none of `NARROW`, there are fewer than two steps, or a range is too
+            narrow and `narrow` is `refuse`.
     """
+    check_choice("narrow", narrow, NARROW)
     # All (source, episode, step) that count [n, 3].
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):

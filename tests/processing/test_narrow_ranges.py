@@ -116,6 +116,11 @@ def test_statistics_of_other_data_are_compared_with_these(tmp_path: Path) -> Non
     assert widened.actions.q01[1] < -299 and widened.actions.q01[0] == -1
 
 
+def test_a_misspelt_choice_is_refused_before_the_data_are_read() -> None:
+    with pytest.raises(UserError, match="narrow.*widen"):
+        compute_norm_stats([], narrow="widne")
+
+
 def training_data(root: Path, **changes: Any) -> DataSettings:
     data = OmegaConf.to_container(OmegaConf.load(REPOSITORY / "configs" / "data" / "sample.yaml"))
     assert isinstance(data, dict)
