@@ -25,10 +25,10 @@ from mme_vla.backbone.layers import (
     attend,
     build_mask,
     compute_dtype,
+    rotary_positions,
     rotate,
     rotation,
     select_rows,
-    token_positions,
 )
 from mme_vla.speed import Recompute, run_layer
 
@@ -334,7 +334,7 @@ class TimeModulations:
         at_time = slice(index * rows, (index + 1) * rows)
 
         def pick(m: Modulation) -> Modulation:
-            return Modulation(m.scale[at_time], m.shift[at_time], m.gate[at_time])
+            return Modulation(m.factor[at_time], m.shift[at_time], m.gate[at_time])
 
         layers = [LayerTimeModulation(pick(m.attention), pick(m.mlp)) for m in self.layers]
         return TimeModulations(layers, pick(self.final))
@@ -377,7 +377,7 @@ class JointTransformer(nn.Module):
         spans = [Span(block.name, len(block)) for block in blocks]
         query_mask = torch.cat([block.mask for block in blocks], 1)
         past_mask = None if past is None else past.mask
-        positions = apply_custom_positions(token_positions(query_mask, past_mask), blocks)
+        positions = apply_custom_positions(rotary_positions(query_mask, past_mask), blocks)
         all_spans = spans
         valid = query_mask
         if past is not None:

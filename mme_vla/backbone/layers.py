@@ -80,22 +80,22 @@ def rotation(positions: Tensor, head_dim: int) -> Rotation:
 
 def rotate(x: Tensor, rope: Rotation) -> Tensor:
     """Rotate queries or keys [b, n, heads, h]; the result keeps the dtype of x."""
-    a, b = x.float().chunk(2, dim=-1)
+    exact = x.float()
+    a, b = exact.chunk(2, dim=-1)
     quarter_turned = torch.cat([-b, a], dim=-1)
-    return torch.addcmul(x.float() * rope.cos, quarter_turned, rope.sin).to(x.dtype)
+    return torch.addcmul(exact * rope.cos, quarter_turned, rope.sin).to(x.dtype)
 
 
 EPS = 1e-6
 
 
-def rms_normalise(x: Tensor) -> Tensor:
-    """Return x / √(mean(x²) + ε) over the last axis, in float32."""
-    x = x.float()
-    return x * (x.square().mean(-1, keepdim=True) + EPS).rsqrt()
+def rms_normalise(x: Tensor, factor: Tensor | None = None) -> Tensor:
+    """Return x / √(mean(x²) + ε) over the last axis, times a factor [d], in float32."""
+    return functional.rms_norm(x.float(), x.shape[-1:], factor, EPS)
 
 
 class RMSNorm(nn.Module):
-    """rms(x)·(1 + scale); the scale starts at 0."""
+    """x/rms(x)·(1 + scale); the scale starts at 0."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -105,20 +105,23 @@ class RMSNorm(nn.Module):
         """Normalise [b, n, d]; the second value is the missing gate, so that both
         norms read alike.
         """
-        return (rms_normalise(x) * (1 + self.scale.float())).to(x.dtype), None
+        return rms_normalise(x, 1 + self.scale.float()).to(x.dtype), None
 
 
 class Modulation(NamedTuple):
-    """What a condition does to one normalised sublayer: each [b or 1, 1, d]."""
+    """What a condition does to one normalised sublayer: each [b or 1, 1, d].
 
-    scale: Tensor
+    factor: 1 + scale(c).
+    """
+
+    factor: Tensor
     shift: Tensor
     gate: Tensor
 
 
 class AdaRMSNorm(nn.Module):
-    """rms(x)·(1 + scale(c)) + shift(c), and a gate(c) for the sublayer's output. Starts as identity
-    with gate 0.
+    """x/rms(x)·(1 + scale(c)) + shift(c), and a gate(c) for the sublayer's output. Starts as
+    identity with gate 0.
     """
 
     keeps_float32 = True
@@ -131,8 +134,9 @@ class AdaRMSNorm(nn.Module):
         nn.init.zeros_(self.dense.bias)
 
     def modulation(self, condition: Tensor) -> Modulation:
-        """Map the condition [b, c] to (scale, shift, gate), in float32 as the condition is."""
-        return Modulation(*float32_linear(self.dense, condition).unsqueeze(1).chunk(3, dim=-1))
+        """Map the condition [b, c] to what it does, in float32 as the condition is."""
+        scale, shift, gate = float32_linear(self.dense, condition).unsqueeze(1).chunk(3, dim=-1)
+        return Modulation(1 + scale, shift, gate)
 
     def forward(self, x: Tensor, condition: Tensor | Modulation) -> tuple[Tensor, Tensor]:
         """Normalise [b, n, d]; the second value is the gate, in the condition's float32:
@@ -141,7 +145,7 @@ class AdaRMSNorm(nn.Module):
         `condition` is the raw [b, c] or, when sampling, a modulation made beforehand.
         """
         m = condition if isinstance(condition, Modulation) else self.modulation(condition)
-        return torch.addcmul(m.shift, rms_normalise(x), 1 + m.scale).to(x.dtype), m.gate
+        return torch.addcmul(m.shift, rms_normalise(x), m.factor).to(x.dtype), m.gate
 
 
 @dataclass
@@ -173,7 +177,7 @@ class Span(NamedTuple):
     length: int
 
 
-def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
+def rotary_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
     """Rotary positions [b, n]: valid tokens are counted, padding repeats the number before it (−1
     first).
     """

@@ -52,19 +52,17 @@ class ModulatorLayer(nn.Module):
         k, v = kv.chunk(2, dim=-2)
         return rotate(k, rope), v
 
-    def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-        """r: what actions [b, h, d] read from memory; their positions come after all memory slots,
-        padding included.
+    def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor, rope: Rotation) -> Tensor:
+        """r: what actions [b, h, d] read from memory, their queries rotated by the first h of
+        `rope`.
         """
         q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
-        first = k.shape[1]
-        positions = torch.arange(first, first + x.shape[1], device=x.device)[None]
-        q = rotate(q, rotation(positions, self.head_dim))
+        q = rotate(q, rope.rows(slice(x.shape[1])))
         return self.out(attend(q, k, v, mask))
 
-    def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-        """x̂ = rms(x)·(1 + a) + β with (a, β) = W r + b."""
-        a, beta = self.modulation(self.read_memory(x, k, v, mask)).float().chunk(2, dim=-1)
+    def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor, rope: Rotation) -> Tensor:
+        """x̂ = x/rms(x)·(1 + a) + β with (a, β) = W r + b."""
+        a, beta = self.modulation(self.read_memory(x, k, v, mask, rope)).float().chunk(2, dim=-1)
         if self.exact_identity:
             # The same direction at x's own size: the norm that follows removes it, and a = β = 0
             # gives x to the bit.
@@ -105,7 +103,7 @@ class Modulator(Integration):
             ModulatorLayer(self.memory_width, num_heads, num_kv_heads, head_dim, exact_identity)
             for _ in range(backbone.depth)
         )
-        self.head_dim = head_dim
+        self.head_dim, self.horizon = head_dim, backbone.horizon
         self._keys_values: Callable[..., tuple[Tensor, Tensor]] = ModulatorLayer.keys_values
 
     def compile(self, **options: Any) -> None:
@@ -117,16 +115,19 @@ class Modulator(Integration):
     def hook(self, memory: MemoryTokens | None) -> Hook:
         memory = required(memory)
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
-        # Queries have positions after all memory slots, padding included; those of memory count
+        # Actions have positions after all memory slots, padding included; those of memory count
         # from the same origin.
-        positions = torch.arange(tokens.shape[1], device=tokens.device)[None]
+        n = tokens.shape[1]
+        slots = torch.arange(n + self.horizon, device=tokens.device)[None]
+        positions = slots[:, :n]
         if self.memory_position == "time":
-            positions = tokens.shape[1] - 1 - ages_of(memory)
+            positions = n - 1 - ages_of(memory)
         rope = rotation(positions, self.head_dim)
+        query_rope = rotation(slots[:, n:], self.head_dim)
         # Every action sees the same keys: b 1 1 m.
         mask = additive_mask(memory.mask[:, None], tokens.dtype)
         hooks = []
         for layer in self.layers:
             k, v = self._keys_values(layer, tokens, rope)
-            hooks.append(partial(layer, k=k, v=v, mask=mask))
+            hooks.append(partial(layer, k=k, v=v, mask=mask, rope=query_rope))
         return LayerHooks(hooks)

@@ -17,8 +17,8 @@ from mme_vla.memory.history import (
 )
 from mme_vla.registry import MEMORIES
 
-FIRST_FRAME_SCORE = 1000.0  # above any change, so that the first frame always stays
-THRESHOLD = 1e-4  # patches that changed less are never candidates
+FIRST_FRAME_SCORE = np.inf  # above any score, so that the first frame always stays
+THRESHOLD = 1e-4  # patches whose score is lower are never candidates
 
 
 @dataclass
@@ -92,17 +92,16 @@ class TokenDrop(PerceptualMemory):
         Args:
             grid: side of a frame's token grid.
             stride: frames between two scored ones.
-            candidates: length of the list of best patches that is kept along an episode. With
-                `causal` it has no effect, except that it is at least the budget.
-            causal: only frames up to the current one compete for that list. False lets the whole
-                episode compete, as the released offline preprocessing does; it needs a finished
-                episode.
+            candidates: how many of the best patches compete for the budget. With `causal` it has no
+                effect, except that it is at least the budget.
+            causal: only frames up to the current one compete. False lets the whole episode compete,
+                as the released offline preprocessing does; it needs a finished episode.
         """
         check_sizes("memory", stride=stride)
         require(
             grid**2 <= budget <= candidates,
             f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
-            f"memory.candidates={candidates} (the patches a running list holds).",
+            f"memory.candidates={candidates} (the patches that compete).",
         )
         scorer = self.Scorer(grid, stride)
         storage = StorageSpec(grid, pooling, keep_every=stride, scorer=scorer.key)
@@ -118,7 +117,7 @@ class TokenDrop(PerceptualMemory):
     ) -> np.ndarray:
         patches = self.storage.grid**2
         if self.causal:
-            # No candidate is later than `step`: the best `budget` of all are those of the list.
+            # No candidate is later than `step`: the best `budget` are among any more of them.
             ranked = ranked_patches(history.scores.until(step), patches, self.budget)
         else:
             ranked = ranked_patches(history.scores, patches, self.candidates)
@@ -126,10 +125,8 @@ class TokenDrop(PerceptualMemory):
 
 
 def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
-    """The best `limit` candidates as (frame, patch) [n, 2], ascending by (score, frame, patch).
-
-    This is what a heap of that size holds after all frames have passed; the first frame's patches
-    rank highest.
+    """The best `limit` candidates as (frame, patch) [n, 2], best last: ascending by (score, frame,
+    patch). The first frame's patches rank highest.
     """
     # The first frame's patches are added below, also where a scorer scores that frame.
     is_later = scores.frames > 0

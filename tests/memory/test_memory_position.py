@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError, build_policy
-from mme_vla.backbone.layers import apply_custom_positions, token_positions
+from mme_vla.backbone.layers import apply_custom_positions, rotary_positions
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing import check_integration
@@ -72,7 +72,7 @@ def test_a_dropped_frame_shifts_the_distance_the_older_ones_stand_from_the_view_
         observed = policy.backbone.embed(replace(views, images=views.images.float()))
         blocks = policy.integration.blocks(observed, memory)
         positions = apply_custom_positions(
-            token_positions(torch.cat([block.mask for block in blocks], 1)), blocks
+            rotary_positions(torch.cat([block.mask for block in blocks], 1)), blocks
         )
         return float(positions[0, len(blocks[0])] - positions[0, 0])
 

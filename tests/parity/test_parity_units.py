@@ -21,15 +21,15 @@ from mme_vla.backbone.layers import (
     attend,
     attention_mask,
     rms_normalise,
+    rotary_positions,
     rotate,
     rotation,
-    token_positions,
 )
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.integration.base import MEMORY_VISIBILITY
 from mme_vla.integration.modulator import ModulatorLayer
 from mme_vla.memory.base import FeatureEncoder, position_features
-from mme_vla.memory.base import token_positions as patch_positions
+from mme_vla.memory.base import token_positions
 from mme_vla.weights.tables import Piece, linear, prefixed, read
 
 TOLERANCE = 1e-4
@@ -194,7 +194,7 @@ def test_masks_and_positions_of_arbitrary_blocks(unit):
         ).numpy()
         mask, _ = released_attention_mask(flags, no_attend, valid)
         assert torch.equal(mask, tensors[f"{case}/attn_mask"]), case
-        assert torch.equal(token_positions(valid).int(), tensors[f"{case}/positions"]), case
+        assert torch.equal(rotary_positions(valid).int(), tensors[f"{case}/positions"]), case
 
 
 def test_visibility_table_is_the_released_rule(parity):
@@ -220,7 +220,7 @@ def test_visibility_table_is_the_released_rule(parity):
         assert torch.equal(
             attention_mask(spans, spans, valid, valid, MEMORY_VISIBILITY), tensors["out/attn_mask"]
         )
-        assert torch.equal(token_positions(valid).int(), tensors["out/positions"])
+        assert torch.equal(rotary_positions(valid).int(), tensors["out/positions"])
 
 
 def test_position_features(unit):
@@ -229,7 +229,7 @@ def test_position_features(unit):
         dim, grid = (int(part.lstrip("dimgr")) for part in key.removeprefix("out/").split("_"))
         for row, frame in enumerate(tensors[f"in/dim{dim}_frames"].tolist()):
             indices = np.stack([np.full(grid**2, frame), np.arange(grid**2)], 1)
-            actual = position_features(torch.from_numpy(patch_positions(indices, grid)), dim)
+            actual = position_features(torch.from_numpy(token_positions(indices, grid)), dim)
             assert error(actual, tensors[key][row]) <= TOLERANCE, key
 
 
@@ -283,8 +283,11 @@ def test_modulator(unit):
     positions = torch.arange(tensors["in/memory"].shape[1])[None]
     k, v = layer.keys_values(tensors["in/memory"], rotation(positions, layer.head_dim))
     mask = additive_mask(tensors["in/memory_mask"][:, None], torch.float32)
-    assert error(layer.read_memory(tensors["in/x"], k, v, mask), tensors["out/r"]) <= TOLERANCE
-    assert error(layer(tensors["in/x"], k, v, mask), tensors["out/x_hat"]) <= TOLERANCE
+    x = tensors["in/x"]
+    after = torch.arange(k.shape[1], k.shape[1] + x.shape[1])[None]
+    rope = rotation(after, layer.head_dim)
+    assert error(layer.read_memory(x, k, v, mask, rope), tensors["out/r"]) <= TOLERANCE
+    assert error(layer(x, k, v, mask, rope), tensors["out/x_hat"]) <= TOLERANCE
 
 
 def test_time_embedding(unit):
