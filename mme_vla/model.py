@@ -4,8 +4,8 @@
     history ───────── memory ──────────► tokens ─┴─► integration.inject ──► Injection
     Injection, noise ─ backbone.loss or backbone.sample ──► loss [b, h] or chunk [b, h, a]
 
-Data flows down once. The backbone does not call the integration, and neither knows which memory
-made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are in other
+Data flows down once. The backbone knows of the integration a hook alone, and neither knows which
+memory made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are in other
 packages.
 
 From image to loss in the order of the calls, with FrameSamp and Modulator:
@@ -130,7 +130,7 @@ class MMEModel(nn.Module):
 
     def prompt_condition(self, batch: Batch) -> Callable[[Tensor], Tensor]:
         """What makes stored tokens [b, n, d_vision] those that the backbone reads with the batch's
-        prompts (of `pi05` the same). A selection goes through it in `memory_tokens`, and an
+        prompts; for `pi05` the tokens as they are. A selection goes through it in `memory_tokens`, and an
         episode's tokens as they are gathered (`PromptConditionedHistory`).
         """
         return partial(
@@ -178,7 +178,8 @@ class MMEModel(nn.Module):
         ones of the memory.
 
         Args:
-            batch, noise: with `actions`, and as `training_noise` makes it, on the model's device.
+            batch: with `actions`, on the model's device.
+            noise: as `training_noise` makes it, on the same device.
             memory: memory tokens; by default those of `batch.history`.
             augmentation: random numbers [b, …] of the image augmentation; None augments nothing.
             metrics: receives what is worth logging, detached: `loss`, and if there are auxiliary

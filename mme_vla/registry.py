@@ -31,7 +31,7 @@ class Command:
     config: the YAML file of the tree's top level that configures it; empty for commands with
         options.
     processes: what it does where a launcher starts several: `one` is refused, `shared` divides the
-        work, `any` only reads.
+        work, `any` may run in each.
     reads_words: its `main` reads the command line itself, and takes no configuration.
     check: `module:function` that reads the configuration, plain and resolved, before PyTorch is
         imported, and raises a `UserError` on values that cannot work.

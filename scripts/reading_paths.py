@@ -1,11 +1,11 @@
-"""Files, functions and lines that a reader needs for seven questions about the library
+"""Files, functions and lines that a reader needs for eight questions about the library
 (docs/extend/layout.md).
 
 (a), (d) and (g) read the tables of docs/extend/architecture.md, whose functions are counted; the
 others list the files on the way. Every file is checked to exist, and every function of (a), (d),
-(f) and (g) to be defined where it is listed.
+(f), (g) and (h) to be defined where it is listed.
 
-    python scripts/reading_paths.py
+    uv run python scripts/reading_paths.py
 """
 
 import ast
@@ -42,6 +42,10 @@ EPISODE_BESIDE = [
     ("policy/base.py", "Policy.act"), ("envs/interface.py", "RoboMMEEnv.step"),
 ]  # fmt: skip
 """Functions that the rows of (g) name and do not list."""
+EXTENSIONS = [
+    ("registry.py", "installed_extensions"), ("config/trees.py", "library_trees"),
+    ("policy/saving.py", "policy_class"), ("cli/table.py", "commands"),
+]  # fmt: skip
 ALONE = "README.md"
 QUESTIONS = (
     "How does FrameSamp + Modulator work, from images and stored tokens to the loss?",
@@ -50,9 +54,10 @@ QUESTIONS = (
     "Where is an action chunk sampled?",
     "Backbone, memory and integration alone in your own training loop",
     "What does `mme_vla.train` do, from the command line to a checkpoint?",
-    "What happens to an episode, from `mme_vla.evaluate` to its record?",
+    "What happens to an episode, from `mme-vla evaluate` to its record?",
+    "How is a method or a command of an extra or a package found?",
 )
-"""(a) to (g), as docs/extend/layout.md has them."""
+"""(a) to (h), as docs/extend/layout.md has them."""
 
 
 def check(files: list[Path]) -> list[Path]:
@@ -147,9 +152,9 @@ def count(files: list[Path]) -> str:
 
 
 def answers() -> list[tuple[str, list[Path]]]:
-    """What (a) to (g) take, and the files."""
+    """What (a) to (h) take, and the files."""
     lines, modules = example()
-    trained = defining(TRAINING)
+    trained, extensions = defining(TRAINING), defining(EXTENSIONS)
     selection, head = (check([PACKAGE / n for n in names]) for names in (SELECTION, HEAD))
     return [
         chained(LOSS),
@@ -159,6 +164,7 @@ def answers() -> list[tuple[str, list[Path]]]:
         (f"{lines} lines, {modules} modules imported", [ROOT / ALONE]),
         (count(trained), trained),
         chained(EPISODE),
+        (count(extensions), extensions),
     ]
 
 

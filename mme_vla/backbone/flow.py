@@ -78,7 +78,7 @@ PredictAt = Callable[[Tensor, int], Tensor]
 @HEADS.register("flow")
 class FlowHead:
     """Flow matching as π0.5 has it: time distribution, loss and velocity of a network that predicts
-    the velocity. The Euler steps themselves are in `Pi05Backbone.sample`.
+    the velocity. The loop over Euler steps is in `Pi05Backbone.sample`.
 
     A head of your own overrides what differs, registers under a name and is chosen with
     `backbone.head.name`.

@@ -182,7 +182,7 @@ def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
 class Querying(NamedTuple):
     """A segment with queries, between its projection and the end of its layer.
 
-    layer: its expert's. Looked up a second time, it would need compiled code for each length.
+    layer: its expert's. A second lookup by name would make compiled code depend on the length.
     rows: its place in the sequence.
     x: its tokens [b, n, d].
     gate: of the attention's output.

@@ -206,17 +206,17 @@ class Pi05Backbone(
         default).
 
         All that does not depend on x is computed once: keys and values of the prefix, and every
-        layer's modulations of all times. A step runs the action block alone. Memory tokens are
-        encoded before, by the model or the policy, and the modulator's keys and values of them come
-        with `injection`.
+        layer's modulations of all times. A step runs the action block and the blocks beside it.
+        Memory tokens are encoded before, by the model or the policy, and the modulator's keys and
+        values of them come with `injection`.
         """
         steps = self.head.steps if steps is None else steps
         x = self.head.start(noise, steps, batch.overlap)
         times = self.head.times(steps, x.device)
 
-        # Prefill: one pass over images, prompt and memory leaves their keys and values in a cache
-        # with space for a step's own.
-        step_blocks = [*injection.beside, self.action_block(x)]  # for their lengths and masks
+        # Prefill: one pass over images, prompt and memory blocks leaves their keys and values in a
+        # cache with space for a step's own.
+        step_blocks = [*injection.beside, self.action_block(x)]  # only lengths and masks are read
         step_length = sum(len(block) for block in step_blocks)
         space = self.transformer.cache_space(injection.blocks, step_length)
         prefix_layout = self.transformer.layout(injection.blocks, injection.visibility)

@@ -18,7 +18,7 @@ from mme_vla.registry import installed_extensions
 
 TRUST_FLAG, TRUST_WORD = "--trust-plugins", "trust_plugins=true"
 """How one says on a command line that the plugins of a checkpoint may be imported; every command
-takes both.
+of the library takes both.
 """
 
 _MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")

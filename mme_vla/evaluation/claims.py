@@ -141,8 +141,9 @@ class Claims:
     def _holds(
         self, claim: Claim, key: EpisodeKey, finished_by: dict[str, set[EpisodeKey] | None]
     ) -> bool:
-        """Whether the claim's process is alive (None in `finished_by`) or has finished
-        the episode.
+        """Whether the claim's process is alive, or has finished the episode.
+
+        finished_by: of each file of records, what it has; None while its process is alive.
         """
         records = claim.records
         if records is None:

@@ -48,7 +48,7 @@ def fingerprint(settings: Mapping[str, Any]) -> str:
     return digest(settings, 64)
 
 
-def claim_run(
+def begin_run(
     folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Begin a run in `folder`, or continue with the one that is there.

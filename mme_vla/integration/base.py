@@ -16,13 +16,12 @@ MEMORY_VISIBILITY: Visibility = {
     "prompt": {"memory", "images", "prompt"},
     "action": {"memory", "images", "prompt", "action"},
 }
-"""As released, wherever memory is a block. The paper's text has one word less: the prompt does not
-see memory.
+"""As released, wherever memory is a block. In the paper's text the prompt does not see memory.
 """
 
 
 def memory_visibility(prompt_sees_memory: bool) -> Visibility:
-    """Return the table, with or without that one word."""
+    """Return the table; without `prompt_sees_memory` as the paper's text has it."""
     if prompt_sees_memory:
         return MEMORY_VISIBILITY
     return {**MEMORY_VISIBILITY, "prompt": PI05_VISIBILITY["prompt"]}

@@ -10,17 +10,15 @@ from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
 
 
-def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
-    """Frames 0 … `step`: all of them while they fit in `count`, else `count` evenly spaced ones,
-    both ends included.
-
-    One frame is the current one.
+def evenly_spaced_frames(last: int, count: int) -> np.ndarray:
+    """Numbers 0 … `last`: all of them while they fit in `count`, else `count` evenly spaced ones,
+    both ends included. With a `count` of 1 the last.
     """
-    if step < count:
-        return np.arange(step + 1)
+    if last < count:
+        return np.arange(last + 1)
     if count == 1:
-        return np.array([step])
-    return np.linspace(0, step, count).astype(np.int64)
+        return np.array([last])
+    return np.linspace(0, last, count).astype(np.int64)
 
 
 def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> np.ndarray:

@@ -33,7 +33,7 @@ class StorageSpec:
         stored. It divides the backbone's (`check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
-        Options of memories call this interval `stride` or `spacing`, keys of a cache `every`.
+        Options of memories call this interval `every` or `stride`, keys of a cache `every`.
     scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`);
         empty for none.
     """

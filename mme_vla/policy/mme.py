@@ -6,7 +6,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -59,7 +58,7 @@ if TYPE_CHECKING:
 
 
 @POLICIES.register("mme")
-class MMEPolicy(NetworkPolicy):
+class MMEPolicy(NetworkPolicy, Recomputes):
     """One composition of backbone, memory and integration, as a policy. No method depends on the
     variant.
 
@@ -416,7 +415,7 @@ class MMEPolicy(NetworkPolicy):
     def encode_memories(
         self, episodes: Sequence[Episode], batch: Batch | None = None
     ) -> MemoryTokens | None:
-        """Memory tokens of running episodes, from the states of their streams.
+        """Memory tokens of running episodes, from their histories and streams.
 
         Args:
             batch: of `observation`, whose prompts the backbone may read stored tokens with; made
@@ -434,12 +433,6 @@ class MMEPolicy(NetworkPolicy):
                 episode.read = history
                 histories.append(history)
             return self.memory.encode(histories, [episode.stream for episode in episodes])
-
-    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
-        """What the memory reads; nothing without one."""
-        if self.memory is None:
-            return np.zeros(0, np.int64)
-        return self.memory.frames_read(steps, exec_start)
 
     @property
     def memory_tower(self) -> MemoryTower:

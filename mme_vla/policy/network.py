@@ -14,7 +14,6 @@ from mme_vla.backbone.layers import autocast
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.speed import Recomputes
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import MemoryTokens
 
@@ -36,11 +35,12 @@ class MemoryTower(NamedTuple):
     settings: Sequence[str] = ()
 
 
-class NetworkPolicy(Policy, Recomputes):
+class NetworkPolicy(Policy):
     """A policy of one network.
 
     A subclass sets its modules, `memory` and the fields of `info` that have other values, and
-    implements `memory_tower` if it has a memory, and what `Policy` requires.
+    implements `memory_tower` if it has a memory, `frames_read` if its episodes read frames of which
+    no memory knows, and what `Policy` requires.
     """
 
     action_dim: int
@@ -107,9 +107,9 @@ class NetworkPolicy(Policy, Recomputes):
             return self.memory.prepare(episode.read, episode.stream)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """Frames that the memory reads; without memory, any."""
+        """Frames that the memory reads; none without memory."""
         if self.memory is None:
-            return None
+            return np.zeros(0, np.int64)
         return self.memory.frames_read(steps, exec_start)
 
     # Cost

@@ -59,7 +59,7 @@ class Scheduler[R: Reading, A, L]:
         self.reading: deque[R] = deque()
         self.acting: deque[A] = deque()
         self.later: WeakKeyDictionary[L, None] = WeakKeyDictionary()
-        """What has acted and will act again."""
+        """Episodes that execute a chunk, whose next one may be prepared meanwhile."""
 
     def __bool__(self) -> bool:
         return bool(self.reading or self.acting or self.later)

@@ -204,3 +204,7 @@ def test_the_shortest_method_and_its_command_work(installed: str, tmp_path: Path
     losses = [line["train/loss"] for line in read_metrics(tmp_path / "run")]
     assert len(losses) == 2 and np.isfinite(losses).all()
     served(tmp_path, env, "checkpoint=run", "--trust-plugins")
+    recomputing = ("train.gradient_checkpointing=true", "output=again")
+    words = ("train", "model=one_layer", *BRIEF[:-1], *recomputing)
+    done = commands.run("mme_vla", *words, cwd=tmp_path, env=env)
+    assert done.returncode != 0 and "OneLayer cannot recompute activations" in done.stderr

@@ -24,7 +24,7 @@ from mme_vla.evaluation import receipts
 from mme_vla.evaluation.records import EpisodeRecord, RecordLog
 from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import claim_run, fingerprint, read_records
+from mme_vla.evaluation.store import begin_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
 from mme_vla.policy.identity import checkpoint_label
 from mme_vla.policy.training_identity import TrainingIdentity
@@ -61,7 +61,7 @@ def run(
     policy = Policy.from_pretrained(checkpoint)
     settings = RolloutSettings(execute=execute)
     facts = facts_of(policy, None, str(checkpoint), settings, None)
-    claimed = claim_run(folder, run_settings(policy, facts, settings, None, str(checkpoint)))
+    claimed = begin_run(folder, run_settings(policy, facts, settings, None, str(checkpoint)))
     path = folder / "episodes.jsonl"
     with (
         RecordLog(path) as log,

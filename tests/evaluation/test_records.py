@@ -25,7 +25,7 @@ from mme_vla.evaluation.records import (
 )
 from mme_vla.evaluation.store import (
     check_run_folder,
-    claim_run,
+    begin_run,
     find_records,
     read_records,
     read_run,
@@ -200,28 +200,28 @@ def test_a_task_of_one_name_in_two_environments_is_refused() -> None:
 
 def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     settings = {"checkpoint": 100, "seeds": (7, 42), "env": {"split": "test", "max_steps": 1300}}
-    first = claim_run(tmp_path, settings, notes={"device": "cpu"})
-    assert claim_run(tmp_path, settings, notes={"device": "cuda"}) == first == read_run(tmp_path)
+    first = begin_run(tmp_path, settings, notes={"device": "cpu"})
+    assert begin_run(tmp_path, settings, notes={"device": "cuda"}) == first == read_run(tmp_path)
     other = {**settings, "env": {"split": "test", "max_steps": 300}, "extra": 1}
     with pytest.raises(
         UserError, match=r"env.max_steps was 1300, is 300; extra was 'not set', is 1"
     ):
-        claim_run(tmp_path, other)
+        begin_run(tmp_path, other)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
 
 
 def test_a_run_of_compressed_records_is_not_run_again(tmp_path: Path) -> None:
-    claim_run(tmp_path, {"a": 1})
+    begin_run(tmp_path, {"a": 1})
     (tmp_path / "episodes.jsonl.xz").write_bytes(b"")
     with pytest.raises(UserError, match=r"episodes\.jsonl\.xz is compressed.*unpack it"):
-        claim_run(tmp_path, {"a": 1})
+        begin_run(tmp_path, {"a": 1})
 
 
 def test_a_folder_of_something_else_is_not_filled_with_records(tmp_path: Path) -> None:
     for name in ("new", "empty", "run", "records", "begun", "foreign"):
         (tmp_path / name).mkdir()
     (tmp_path / "new").rmdir()
-    claim_run(tmp_path / "run", {"a": 1})
+    begin_run(tmp_path / "run", {"a": 1})
     (tmp_path / "records" / "episodes-0.jsonl").write_text("")
     draft_of(tmp_path / "begun" / "run.json").write_text("")
     for name in ("new", "empty", "run", "records", "begun"):
@@ -239,7 +239,7 @@ def test_a_folder_of_something_else_is_not_filled_with_records(tmp_path: Path) -
 
 
 def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:
-    claim_run(tmp_path, {"a": 1})
+    begin_run(tmp_path, {"a": 1})
     path = tmp_path / "run.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "settings": {"a": 2}}))
     with pytest.raises(UserError, match="changed manually"):
@@ -256,10 +256,10 @@ def test_a_run_begins_and_resumes_where_there_are_no_hard_links(
         raise PermissionError("Operation not permitted")
 
     monkeypatch.setattr("os.link", no_links)
-    first = claim_run(tmp_path, {"a": 1})
-    assert claim_run(tmp_path, {"a": 1}) == first == read_run(tmp_path)
+    first = begin_run(tmp_path, {"a": 1})
+    assert begin_run(tmp_path, {"a": 1}) == first == read_run(tmp_path)
     with pytest.raises(UserError, match="a was 1, is 2"):
-        claim_run(tmp_path, {"a": 2})
+        begin_run(tmp_path, {"a": 2})
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
 
 
@@ -270,7 +270,7 @@ def test_processes_of_one_number_on_two_machines_do_not_share_a_file(
     monkeypatch.setattr("os.getpid", lambda: 1)
     monkeypatch.setattr("os.link", lambda source, _: linked.append(source))
     for _ in range(2):
-        claim_run(tmp_path, {"a": 1})
+        begin_run(tmp_path, {"a": 1})
     assert len(set(linked)) == 2
 
 

@@ -40,7 +40,7 @@ from mme_vla.evaluation.results.tables import (
     to_latex,
     to_markdown,
 )
-from mme_vla.evaluation.store import claim_run
+from mme_vla.evaluation.store import begin_run
 
 # Where the paper's suite and group tables differ from the means of its own per-task table.
 MISPRINTS = {
@@ -503,7 +503,7 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
         "integration": {"name": "expert"},
         "card": {"data": "robomme", "recipe": {"steps": 80000, "batch_size": 64, "lr": 5e-5}},
     }
-    claim_run(
+    begin_run(
         tmp_path / "a", {"model": "ttt_expert", "checkpoint": 100}, {"policy": policy_facts(config)}
     )
     for folder, name in (("a", "ttt_expert"), ("b", "pi05")):

@@ -20,7 +20,7 @@ from mme_vla.data.convert import convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.evaluation.records import EpisodeRecord, RecordLog, Seconds
-from mme_vla.evaluation.store import RECORDS, claim_run
+from mme_vla.evaluation.store import RECORDS, begin_run
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.rows import RowDataset
@@ -105,7 +105,7 @@ def write_cache(folder: Path) -> None:
 
 def write_logs(folder: Path) -> None:
     """Records of five episodes and the settings of their run."""
-    claim_run(folder, {"checkpoint": "a", "seed": 7, "tasks": ["PickXtimes"]}, {"device": "cpu"})
+    begin_run(folder, {"checkpoint": "a", "seed": 7, "tasks": ["PickXtimes"]}, {"device": "cpu"})
     with RecordLog(folder / RECORDS) as log:
         for episode in range(5):
             outcome = "success" if episode % 2 else "timeout"

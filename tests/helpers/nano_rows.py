@@ -9,7 +9,7 @@ import yaml
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.envs.metadata import episodes
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.store import claim_run
+from mme_vla.evaluation.store import begin_run
 from mme_vla.policy.saving import composition_digest
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import write_json
@@ -40,7 +40,7 @@ def write_training(
         "embodiment": ROBOMME_JOINT.to_dict(),
     }
     settings = {"model": model, "checkpoint": 100, "seed": 7, "split": SPLIT, "max_steps": 500}
-    claim_run(folder, settings)
+    begin_run(folder, settings)
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     costs = {
         "parameters": 1_419_194,

@@ -28,8 +28,7 @@ from mme_vla.backbone.layers import (
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.integration.base import MEMORY_VISIBILITY
 from mme_vla.integration.modulator import ModulatorLayer
-from mme_vla.memory.base import FeatureEncoder, position_features
-from mme_vla.memory.base import token_positions
+from mme_vla.memory.base import FeatureEncoder, position_features, token_positions
 from mme_vla.weights.tables import Piece, linear, prefixed, read
 
 TOLERANCE = 1e-4

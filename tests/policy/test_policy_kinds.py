@@ -4,10 +4,14 @@ extremes.
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, register
 from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.evaluation.rollout.running import RenderPlan
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.saving import composition_digest, policy_class, policy_options
 from mme_vla.training.settings import TrainSettings
 
@@ -54,6 +58,21 @@ def test_a_kind_comes_back_as_what_it_was(tmp_path: Any) -> None:
         is type(MMEPolicy.from_pretrained(tmp_path))
         is QuietPolicy
     )
+
+
+class Memoryless(NetworkPolicy):
+    """A network of its own, without a memory."""
+
+    memory = None
+    embodiment = ROBOMME_JOINT
+
+
+def test_without_a_memory_only_the_frames_of_decisions_are_rendered() -> None:
+    policy = Memoryless()
+    read = policy.frames_read(np.arange(5), 0)
+    assert read is not None and not len(read)
+    request = RenderPlan(policy, None, RolloutSettings()).before_video()
+    assert request is not None and not any(7 in frames for frames in request.frames.values())
 
 
 def test_the_default_kind_changes_no_digest_and_another_does() -> None:

@@ -117,7 +117,7 @@ def test_statistics_of_other_data_are_compared_with_these(tmp_path: Path) -> Non
 
 
 def test_a_misspelt_choice_is_refused_before_the_data_are_read() -> None:
-    with pytest.raises(UserError, match="narrow.*widen"):
+    with pytest.raises(UserError, match=r"narrow.*widen"):
         compute_norm_stats([], narrow="widne")
 
 

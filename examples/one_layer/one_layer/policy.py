@@ -28,6 +28,7 @@ class OneLayer(NetworkPolicy):
 
     @classmethod
     def from_config(cls, config, processor=None, *, fresh_backbone=True):
+        # The section of π0.5 is composed by default; of it only the size of a chunk is read.
         sizes = config["backbone"]["horizon"], config["backbone"]["action_dim"]
         return cls(*sizes, processor, config, **policy_options(cls, config))
 

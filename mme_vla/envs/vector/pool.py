@@ -62,19 +62,12 @@ class Reply:
     `error` it is a dictionary of it.
     """
     error: Exception | None = None
-    """Why there is no result of the policy: the environment raised it, or the worker died or hung
-    and was replaced.
-    """
+    """Why the command failed: what the environment raised, or a `WorkerCrash`."""
 
     @property
     def is_reset(self) -> bool:
         """Whether it is the result of a reset."""
         return self.reward is None
-
-    @property
-    def crashed(self) -> bool:
-        """Whether there is no result of the policy."""
-        return self.error is not None
 
     @property
     def done(self) -> bool:
@@ -125,7 +118,7 @@ class _Worker:
     deadline: float = math.inf
 
     @property
-    def begun(self) -> Job:
+    def current_job(self) -> Job:
         assert self.job is not None
         return self.job
 
@@ -301,10 +294,10 @@ class VecEnv:
                 kind, content = protocol.receive(state.connection)
                 if kind == protocol.RESULT:
                     state.running = False
-                    return Reply.of_outcome(index, state.begun, state.resetting, content)
+                    return Reply.of_outcome(index, state.current_job, state.resetting, content)
                 if isinstance(content, UserError | SceneError):
                     state.running = False
-                    return Reply.of_failure(index, state.begun, state.resetting, content)
+                    return Reply.of_failure(index, state.current_job, state.resetting, content)
                 # After any other error the process may be of no further use: a renderer that has
                 # lost its device fails until its process ends.
                 return self._replace(index, content)
@@ -324,7 +317,7 @@ class VecEnv:
         old.process.join(1.0)  # unless it hangs, it closes its environment and ends by itself
         protocol.end(old.process)
         self._workers[index] = self._spawn()
-        return Reply.of_failure(index, old.begun, old.resetting, error)
+        return Reply.of_failure(index, old.current_job, old.resetting, error)
 
     def _require_open(self) -> None:
         require(not self._closed, "The environments are closed; make new ones.")

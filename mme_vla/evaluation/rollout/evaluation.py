@@ -33,7 +33,7 @@ from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
     check_run_folder,
-    claim_run,
+    begin_run,
     fingerprint,
 )
 from mme_vla.policy.base import Policy
@@ -341,7 +341,7 @@ class EvaluationRun:
         decisive = run_settings(
             self.policy, self.facts, self.settings, options.subgoals, options.source
         )
-        content = claim_run(self.folder, decisive, options.notes)
+        content = begin_run(self.folder, decisive, options.notes)
         workload = Workload()
         with RecordLog(self.folder / options.shard.file) as log:
             check_sharing(self.folder, log.path.name)

@@ -4,7 +4,7 @@ from mme_vla.envs.vector.pool import Reply
 from mme_vla.errors import SceneError, UserError, place_of, text_of
 
 GIVE_UP_AFTER = 8  # episodes in a row that could not be started, or without a chunk
-SAME_ERRORS = 2  # equal errors of an environment's code, in a row
+SAME_ERRORS = 2  # equal errors that an environment's code raised, in a row
 
 
 class FailureStreaks:
@@ -28,8 +28,8 @@ class FailureStreaks:
         """An episode ended with this reply of its environment.
 
         message: of the error; None without one.
-        is_repeated: whether the episode had been tried before. Among those, all that failed for
-            rare reasons meet.
+        is_repeated: whether the episode had been tried before. Such are not counted: they are the
+            ones that failed, so failures follow each other among them.
 
         Raises:
             UserError: the environment's own code failed in the same way again, or

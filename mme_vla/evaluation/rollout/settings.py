@@ -29,7 +29,7 @@ class RolloutSettings:
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last
         bit.
-    encode_chunk: frames encoded before other episodes may act.
+    encode_chunk: frames of a video encoded at a time, before other episodes may act.
     retries: how often an episode whose environment failed is tried again before the run continues
         without it.
     timeout_s: seconds after which an environment that does not respond is replaced.

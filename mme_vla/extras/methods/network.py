@@ -3,11 +3,14 @@
 from mme_vla.errors import UserError
 from mme_vla.memory.base import encode_selection
 from mme_vla.policy.network import NetworkPolicy
+from mme_vla.speed import Recomputes
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
-class MethodPolicy(NetworkPolicy):
-    """A policy of one network that may take a memory, and has no `MMEModel`."""
+class MethodPolicy(NetworkPolicy, Recomputes):
+    """A policy of one network that may take a memory, can recompute activations, and has no
+    `MMEModel`.
+    """
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
         """Encode selections into memory tokens; None without memory or selections."""

@@ -32,7 +32,7 @@ from mme_vla.evaluation.rollout.evaluation import (
     predictor_of,
 )
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import RECORDS, claim_run
+from mme_vla.evaluation.store import RECORDS, begin_run
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.rows import CONFIG, TRAINED
 from mme_vla.extras.play.game import MAX_CHOICES, ChoiceSession
@@ -213,7 +213,7 @@ def play_all(
     """
     settings = {**asdict(rules), "model": name, "max_steps": rules.steps}
     del settings["workers"], settings["shard"]
-    claim_run(folder, settings)
+    begin_run(folder, settings)
     (folder / CONFIG).write_text(f"name: {name}\n", encoding="utf-8")
     write_json(folder / TRAINED, {"row": name, "kind": KINDS[name], "trained": False, "seed": 0})
     file = folder / RECORDS

@@ -12,7 +12,7 @@ from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.evaluation.records import EpisodeRecord, RecordLog, finished, merge, read_records
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
-from mme_vla.evaluation.store import RECORDS, claim_run
+from mme_vla.evaluation.store import RECORDS, begin_run
 from mme_vla.extras.play.game import ChoiceSession
 
 
@@ -83,7 +83,7 @@ class PlayRun:
         retry_errors: bool = False,
     ) -> None:
         self.folder, self.identity, self.make = folder, identity, make
-        claim_run(folder, identity.settings)
+        begin_run(folder, identity.settings)
         self._log = RecordLog(folder / RECORDS)
         self.episodes = list(episodes)
         keys = {(which.task, which.episode) for which in self.episodes}

@@ -32,7 +32,7 @@ from mme_vla.evaluation.rollout.evaluation import (
 )
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import RUN_FILE, claim_run, find_records, fingerprint, read_folders
+from mme_vla.evaluation.store import RUN_FILE, begin_run, find_records, fingerprint, read_folders
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
 from mme_vla.extras.probing.channels import channel_of
@@ -204,7 +204,7 @@ def _on_recordings(
         "recordings": [recording.name for recording in plan.recordings],
         **asdict(plan.offline),
     }
-    claim_run(folder, decisive)
+    begin_run(folder, decisive)
     shard = options.shard
     local = list(plan.recordings)[shard.index :: shard.count]
     path = folder / "offline.jsonl"

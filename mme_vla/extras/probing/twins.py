@@ -36,7 +36,7 @@ from mme_vla.evaluation.rollout.environment import ChunkCommand, ChunkEnv, Episo
 from mme_vla.evaluation.rollout.evaluation import RunOptions, run_settings
 from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import claim_run
+from mme_vla.evaluation.store import begin_run
 from mme_vla.extras.probing.arms import UNPROBED, lacking, read_arm
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.probed import ProbedPolicy
@@ -398,7 +398,7 @@ def run_twins(
         )
     else:
         notes.append(f"{MEMORY_OFF} was left out: it needs {why}.")
-    claim_run(folder, run_settings(policy, facts, settings, None, options.source))
+    begin_run(folder, run_settings(policy, facts, settings, None, options.source))
 
     # The pairs of this shard that the folder lacks.
     shard = options.shard

@@ -19,7 +19,7 @@ from helpers.nano_rows import SCENES, SPLIT, TASKS, records_of, write_records, w
 from mme_vla import UserError
 from mme_vla.envs.metadata import episodes
 from mme_vla.evaluation.results.statistics import percentiles
-from mme_vla.evaluation.store import claim_run, read_folders
+from mme_vla.evaluation.store import begin_run, read_folders
 from mme_vla.extras.nano import board_page
 from mme_vla.extras.nano.board import Board, Row, homogeneity, kendall, pooled, smallest_p, spearman
 from mme_vla.extras.nano.cli import board as board_command
@@ -462,7 +462,7 @@ def test_rows_of_different_rules_do_not_make_a_board(rows: Path, tmp_path: Path)
     folder = write_training(tmp_path, "mine", 0, 3)
     settings = json.loads((folder / "run.json").read_text())["settings"]
     (folder / "run.json").unlink()
-    claim_run(folder, {**settings, "max_actions": 20, "only_possible": True})
+    begin_run(folder, {**settings, "max_actions": 20, "only_possible": True})
     with pytest.raises(
         UserError, match=r"mine/0 has .*, max_choices=20, only_possible=True, but .*None.*False"
     ):

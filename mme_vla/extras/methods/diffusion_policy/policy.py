@@ -285,9 +285,7 @@ class DiffusionPolicy(MethodPolicy):
         processor = self.require_processor()
         if processor.samples.window > 1 and processor.samples.consecutive:
             return None
-        if self.memory is None:
-            return np.zeros(0, np.int64)
-        return self.memory.frames_read(steps, exec_start)
+        return super().frames_read(steps, exec_start)
 
     def require_processor(self) -> DiffusionProcessor:
         processor = super().require_processor()

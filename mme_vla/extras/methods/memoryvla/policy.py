@@ -315,6 +315,12 @@ class MemoryVlaPolicy(MethodPolicy):
             return super().start_episode(goal, seed)
         return MemoryVlaEpisode(self, goal, seed)
 
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """What a memory reads; with banks any frame, since those of the video enter them."""
+        if self.memory is None:
+            return None
+        return super().frames_read(steps, exec_start)
+
     def observation(self, episodes: Sequence[Episode]) -> GroupBatch:
         """The current moments of running episodes, each a group of one; only banks know what number
         theirs has.

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -37,7 +38,7 @@ from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import POLICIES
-from mme_vla.speed import Recompute
+from mme_vla.speed import Recompute, Recomputes
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import Noise, map_noise
 
@@ -155,7 +156,7 @@ WIDTH = 7
 
 
 @POLICIES.register(NAME)
-class SAM2ActPolicy(NetworkPolicy):
+class SAM2ActPolicy(NetworkPolicy, Recomputes):
     """SAM2Act+ (RoboMME's fine-tuned model): one waypoint at a time, which the benchmark's planner
     moves to.
     """
@@ -315,6 +316,10 @@ class SAM2ActPolicy(NetworkPolicy):
             return decide(self.backbone, scene.to(self.device), remembered, self.cube, finder)
 
     # Episodes
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> None:
+        """Any frame: keyframes of the video enter the bank."""
+        return None
 
     def start_episode(self, goal: str, seed: int = 0) -> KeyframeEpisode:
         return KeyframeEpisode(self, goal, seed)

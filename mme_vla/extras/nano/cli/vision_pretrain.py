@@ -17,7 +17,7 @@ from mme_vla.envs.make import require_simulator
 from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import SceneError, UserError, require
-from mme_vla.evaluation.store import claim_run
+from mme_vla.evaluation.store import begin_run
 from mme_vla.extras.nano.pretraining import (
     PretrainSettings,
     Scenes,
@@ -79,7 +79,7 @@ def run(pretraining: PretrainRun) -> Path:
         "lr": pretraining.lr,
         "seed": pretraining.seed,
     }
-    claim_run(folder, identity)
+    begin_run(folder, identity)
     files, held_out = _record(pretraining, tasks, sizes.image_size)
     settings = PretrainSettings(
         steps=pretraining.steps,
