@@ -89,19 +89,21 @@ def run_on(driver: Path, program: str, *words: str) -> str:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
-    ("model", "launches", "products"),
+    ("model", "way", "launches", "products"),
     [
-        ("pi05", 1310, 921),
-        ("framesamp_modul", 1900, 1479),
-        ("tokendrop_expert", 1320, 990),
-        ("ttt_expert", 1320, 990),
-        ("rmt_context", 1320, 921),
+        ("pi05", "compiled", 1310, 921),
+        ("framesamp_modul", "compiled", 1910, 1479),
+        ("tokendrop_expert", "compiled", 1320, 990),
+        ("ttt_expert", "compiled", 1320, 990),
+        ("rmt_context", "compiled", 1320, 921),
+        ("pi05", "eager", 5220, 921),
+        ("framesamp_modul", "eager", 8860, 1479),
     ],
 )
 def test_a_full_size_chunk_launches_few_kernels(
-    model: str, launches: int, products: int, mock_driver: Path
+    model: str, way: str, launches: int, products: int, mock_driver: Path
 ) -> None:
-    words = ("gpu_kernels.py", model, "--ways", "compiled")
+    words = ("gpu_kernels.py", model, "--ways", way)
     counted = json.loads(run_on(mock_driver, *words).splitlines()[-1])
     assert counted["launches"] <= launches
     assert counted["products"] == products
