@@ -3,7 +3,7 @@
 One legend for shapes, used in the whole library:
 
 b batch · n tokens · d width · t frames · v views (cameras) · h action horizon · a action width · l
-prompt length
+prompt length · N query heads · K key and value heads · e width of a head
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -36,7 +36,7 @@ KeyValue = tuple[Tensor, Tensor]
 
 
 class StaticKV(NamedTuple):
-    """Space for the keys and values of one layer [b, tokens, K, h], of which the first `start`
+    """Space for the keys and values of one layer [b, tokens, K, e], of which the first `start`
     tokens are the past's.
     """
 
@@ -45,7 +45,7 @@ class StaticKV(NamedTuple):
     start: int
 
     def filled(self, k: Tensor, v: Tensor) -> KeyValue:
-        """The past's keys and values, and this pass's [b, n, K, h] written behind them."""
+        """The past's keys and values, and this pass's [b, n, K, e] written behind them."""
         stop = self.start + k.shape[1]
         for buffer, new in ((self.k, k), (self.v, v)):
             buffer[:, self.start : stop].copy_(new)
@@ -138,7 +138,7 @@ class ExpertLayer(nn.Module):
     def project(
         self, x: Tensor, rope: Rotation, condition: Tensor | Modulation | None
     ) -> tuple[Tensor | None, Tensor, Tensor, Tensor | None]:
-        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h]
+        """Normalise [b, n, d] and return q [b, n, N, e] (None if `keys_only`), k, v [b, n, K, e]
         and the gate.
 
         Queries and keys come back rotated, by `rope` at their positions.
@@ -235,7 +235,7 @@ class JointBlock(nn.Module):
             condition: what the action expert's norms are conditioned on: the time embedding [b, c]
                 or a modulation.
             hook: see `Hook`, layer already bound.
-            past: keys and values [b, past, K, h] of earlier passes, rotated, with space for this
+            past: keys and values [b, past, K, e] of earlier passes, rotated, with space for this
                 pass's own.
 
         Returns:

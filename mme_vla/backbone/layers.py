@@ -51,7 +51,7 @@ BASE = 10_000.0
 
 
 class Rotation(NamedTuple):
-    """cos and sin of every position's angles, float32 [b, n, 1, h]: both halves turn by the same
+    """cos and sin of every position's angles, float32 [b, n, 1, e]: both halves turn by the same
     angles.
     """
 
@@ -79,7 +79,7 @@ def rotation(positions: Tensor, head_dim: int) -> Rotation:
 
 
 def rotate(x: Tensor, rope: Rotation) -> Tensor:
-    """Rotate queries or keys [b, n, heads, h]; the result keeps the dtype of x."""
+    """Rotate queries or keys [b, n, heads, e]; the result keeps the dtype of x."""
     exact = x.float()
     a, b = exact.chunk(2, dim=-1)
     quarter_turned = torch.cat([-b, a], dim=-1)
@@ -409,13 +409,13 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
     """Scaled dot-product attention with grouped queries: query head n reads key head n // (N/K).
 
     Args:
-        q: [b, q, N, h].
-        k, v: [b, k, K, h].
+        q: [b, q, N, e].
+        k, v: [b, k, K, e].
         mask: of `build_mask`; or additive [b, 1, q, k] in q's dtype; or bool with a key in every
             row; or None.
 
     Returns:
-        [b, q, N·h].
+        [b, q, N·e].
     """
     if mask is not None and not isinstance(mask, Tensor):
         return mask.attend(q, k, v)

@@ -45,7 +45,7 @@ class ModulatorLayer(nn.Module):
         nn.init.zeros_(self.modulation.bias)
 
     def keys_values(self, memory: Tensor, rope: Rotation) -> tuple[Tensor, Tensor]:
-        """Memory [b, m, d] → keys, rotated by `rope`, and values [b, m, K, h]: once per chunk,
+        """Memory [b, m, d] → keys, rotated by `rope`, and values [b, m, K, e]: once per chunk,
         whatever the number of steps.
         """
         kv = self.kv(self.norm(memory)[0]).unflatten(-1, (-1, self.head_dim))

@@ -113,7 +113,7 @@ class RMTLayer(RecurrentLayer):
     def _heads(
         self, x: Tensor, weight: Tensor, rope: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Project x [..., n, hidden] to heads [..., n, heads, h], and rotate all but the values,
+        """Project x [..., n, hidden] to heads [..., n, heads, e], and rotate all but the values,
         which are last: their pairs (2i, 2i + 1), by angles with cosines and sines [n, 1, h/2].
         """
         heads = nn.functional.linear(x, weight).unflatten(-1, (-1, self.head_dim))
@@ -126,8 +126,8 @@ class RMTLayer(RecurrentLayer):
         return torch.stack(rotated, -1).flatten(-2), v
 
     def _attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Every slot attends to every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n,
-        heads·h] float32.
+        """Every slot attends to every key: q [b, n, heads, e], k and v [b, m, kv, e] → [b, n,
+        heads·e] float32.
         """
         b, n, heads, h = q.shape
         # Without a mask, the queries that share a key head are simply more queries of that head.

@@ -52,7 +52,7 @@ class FlexMask(NamedTuple):
         )
 
     def attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query without visible
+        """Attention [b, q, N·e] of q [b, q, N, e] on k, v [b, k, K, e]; a query without visible
         keys returns zeros.
         """
         q, k, v = (x.transpose(1, 2) for x in (q, k, v))
@@ -101,7 +101,7 @@ class PackedMask(NamedTuple):
         return cls(layout, tuple(runs))
 
     def attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query without visible
+        """Attention [b, q, N·e] of q [b, q, N, e] on k, v [b, k, K, e]; a query without visible
         keys returns zeros.
         """
         batch, max_keys = k.shape[:2]

@@ -134,7 +134,7 @@ class Reader(nn.Module):
 
         Args:
             condition: [b·r, d].
-            k, v: of the context, [b, n, N, h].
+            k, v: of the context, [b, n, N, e].
             mask: additive [b, 1, 1, n].
             versions: r.
             hook: changes the MLP's input.
@@ -197,12 +197,12 @@ class Column(nn.Module):
         self.kv = nn.Linear(width, math.prod(self.shape), bias=False)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """[b, n, d] → [layers, 2, b, n, N, h]."""
+        """[b, n, d] → [layers, 2, b, n, N, e]."""
         return self.kv(self.norm(tokens)[0]).unflatten(-1, self.shape).movedim((2, 3), (0, 1))
 
 
 class Context(NamedTuple):
-    """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the
+    """What a chunk reads in every step: keys and values [layers, 2, b, n, N, e], their mask, the
     condition [b, d].
 
     pointing: what the pointer reads: tokens of the first view [b, n, D], and the share of each
