@@ -5,8 +5,8 @@
     Injection, noise ─ backbone.loss or backbone.sample ──► loss [b, h] or chunk [b, h, a]
 
 Data flows down once. The backbone knows of the integration a hook alone, and neither knows which
-memory made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are in other
-packages.
+memory made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are
+in other packages.
 
 From image to loss in the order of the calls, with FrameSamp and Modulator:
 
@@ -130,8 +130,8 @@ class MMEModel(nn.Module):
 
     def prompt_condition(self, batch: Batch) -> Callable[[Tensor], Tensor]:
         """What makes stored tokens [b, n, d_vision] those that the backbone reads with the batch's
-        prompts; for `pi05` the tokens as they are. A selection goes through it in `memory_tokens`, and an
-        episode's tokens as they are gathered (`PromptConditionedHistory`).
+        prompts; for `pi05` the tokens as they are. A selection goes through it in `memory_tokens`,
+        and an episode's tokens as they are gathered (`PromptConditionedHistory`).
         """
         return partial(
             self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask

@@ -172,7 +172,9 @@ class MemoryModule(nn.Module):
             features,
             send(positions, device),
             torch.ones(len(indices), dtype=torch.bool, device=device),
-            torch.full((), int(history.times(np.array(step))), device=device),  # filled there: nothing waits for a copy
+            torch.full(
+                (), int(history.times(np.array(step))), device=device
+            ),  # filled there: nothing waits for a copy
         )
         return pad_selection(selection, padded_length(self, len(indices)), bool(self.pad_left))
 
@@ -351,14 +353,15 @@ POSITIONS = ("time_space", "space", "none")
 
 
 class FeatureEncoder(nn.Module):
-    """token = P [feature | SiLU(W φ(position))]: nothing before, between or after, as released. P is
-    `project`, W is `position`.
+    """token = P [feature | SiLU(W φ(position))]: nothing before, between or after, as released.
+
+    P is `project` and W is `position`, with biases.
 
     Positions are `position_dim` wide: by default 3/8 of the vision width in multiples of 6, 768 at
-    full size. Padding (zero feature, zero φ) becomes the constant P [0 | SiLU(b)] with the bias b of W: only
-    the mask tells it apart. With `positions="space"` the features of the frame, the first third,
-    are zero. With `"none"` there is no W, and token = P feature, which is the released encoder with
-    `use_pos_emb: false`.
+    full size. Padding (zero feature, zero φ) becomes the constant P [0 | SiLU(b)], with the bias b
+    of W: only the mask tells it apart. With `positions="space"` the features of the frame, the
+    first third, are zero. With `"none"` there is no W, and token = P feature, which is the released
+    encoder with `use_pos_emb: false`.
     """
 
     def __init__(

@@ -24,8 +24,8 @@ from mme_vla.evaluation.records import (
     merge,
 )
 from mme_vla.evaluation.store import (
-    check_run_folder,
     begin_run,
+    check_run_folder,
     find_records,
     read_records,
     read_run,

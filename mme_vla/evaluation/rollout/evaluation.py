@@ -32,8 +32,8 @@ from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
-    check_run_folder,
     begin_run,
+    check_run_folder,
     fingerprint,
 )
 from mme_vla.policy.base import Policy

@@ -442,7 +442,7 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
     if policy.memory is None:
         return None
     memory, camera = policy.memory, policy.embodiment.memory_camera
-    read = policy.frames_read(np.array(_decisions(policy, demonstration)), demonstration.exec_start)
+    read = memory.frames_read(np.array(_decisions(policy, demonstration)), demonstration.exec_start)
     frames = np.intersect1d(read, made.frames[camera])
     tokens = pool_grid(made.at(camera, frames).float(), memory.storage.grid, memory.storage.pooling)
     stored = tokens.to(policy.info.history_dtype).float().numpy()
