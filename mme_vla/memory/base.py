@@ -168,14 +168,10 @@ class MemoryModule(nn.Module):
         features = history.gather(indices)
         device = features.device
         positions = torch.from_numpy(token_positions(history.timed(indices), self.storage.grid))
-        selection = HistoryTokens(
-            features,
-            send(positions, device),
-            torch.ones(len(indices), dtype=torch.bool, device=device),
-            torch.full(
-                (), int(history.times(np.array(step))), device=device
-            ),  # filled there: nothing waits for a copy
-        )
+        # Made on the device: nothing waits for a copy.
+        mask = torch.ones(len(indices), dtype=torch.bool, device=device)
+        time = torch.full((), int(history.times(np.array(step))), device=device)
+        selection = HistoryTokens(features, send(positions, device), mask, time)
         return pad_selection(selection, padded_length(self, len(indices)), bool(self.pad_left))
 
     def start_stream(self) -> Any:
