@@ -33,7 +33,7 @@ vision cache.
 Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -43,7 +43,7 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.base import Backbone, Injection
 from mme_vla.backbone.layers import Block, autocast
-from mme_vla.errors import UserError, check_known
+from mme_vla.errors import UserError, check_integer, check_known
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule, encode_selection
 from mme_vla.types import Batch, MemoryTokens, Noise, to_unit_range
@@ -149,8 +149,12 @@ class MMEModel(nn.Module):
         """The observation's blocks with memory added. The batch's images are prepared.
 
         Raises:
-            ValueError: there are more memory tokens than the memory's budget.
+            ValueError: there are more memory tokens than the memory's budget, or of them not one
+                row a sample.
         """
+        if memory is not None:
+            check_rows("MemoryTokens.tokens", memory.tokens, len(batch.prompt))
+            check_shape("MemoryTokens.mask", memory.mask, memory.tokens.shape[:2])
         if memory is not None and self.memory is not None:
             n_tokens = memory.tokens.shape[1]
             if n_tokens > self.memory.budget:
@@ -186,11 +190,13 @@ class MMEModel(nn.Module):
                 losses `losses/<name>` of all, unweighted; `memory/<name>` of the memory's own.
         """
         check_chunks(batch, noise)
+        check_noise(noise, len(batch.prompt))
         batch = self.prepare_images(batch, augmentation)
         if memory is None:
             memory = self.memory_tokens(batch)
         with self.autocast():
             step_losses = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
+        check_rows(f"{type(self.backbone).__name__}.loss", step_losses, len(batch.prompt))
         action = masked_mean(step_losses, batch.action_mask, batch.weight)
 
         auxiliary: dict[str, Tensor] = {}
@@ -245,6 +251,9 @@ class MMEModel(nn.Module):
                 default.
             memory: memory tokens; by default those of `batch.history`.
         """
+        if steps is not None:
+            check_integer("steps", steps)
+        check_noise(noise, len(batch.prompt))
         batch = self.prepare_images(batch)
         if memory is None:
             memory = self.memory_tokens(batch)
@@ -289,11 +298,36 @@ def check_uncounted(block: Block, backbone: Backbone) -> None:
     )
 
 
+def check_rows(what: str, values: Tensor, samples: int) -> None:
+    """Raise an error unless a tensor has one row a sample: others would be broadcast silently."""
+    if values.ndim == 0 or len(values) != samples:
+        raise ValueError(
+            f"{what} has shape {list(values.shape)}: it needs one row for each of {samples}"
+            " samples."
+        )
+
+
+def check_shape(what: str, values: Tensor | None, shape: Sequence[int]) -> None:
+    """Raise an error unless a tensor, if there is one, has a shape."""
+    if values is not None and values.shape != tuple(shape):
+        raise ValueError(f"{what} has shape {list(values.shape)}: it must be {list(shape)}.")
+
+
+def check_noise(noise: Mapping[str, Tensor], samples: int) -> None:
+    """Raise an error unless random numbers have one row a sample."""
+    for name, values in noise.items():
+        check_rows(f"The noise {name!r}", values, samples)
+
+
 def check_chunks(batch: Batch, noise: Mapping[str, Tensor]) -> None:
-    """Raise an error unless a batch has recorded chunks, of the shape of its noise."""
+    """Raise an error unless a batch has recorded chunks, of the shape of its noise, and marks and
+    weights of theirs.
+    """
     if batch.actions is None:
         raise ValueError("A loss needs the recorded chunks: Batch.actions is None.")
     chunks = batch.actions
+    check_shape("Batch.action_mask", batch.action_mask, chunks.shape[:2])
+    check_shape("Batch.weight", batch.weight, chunks.shape[:1])
     random = noise.get("noise")
     # Of another number of dimensions they are added to no chunk: a backbone's own.
     if random is not None and random.ndim == chunks.ndim and random.shape != chunks.shape:

@@ -60,7 +60,7 @@ def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -
 
 
 class Labels(dict[str, Tensor]):
-    """Labels by name, each [b, …]. Inside a `TensorStruct` they move with it."""
+    """Labels, or losses, by name, each [b, …]. Inside a `TensorStruct` they move with it."""
 
 
 class TensorStruct:
@@ -202,6 +202,9 @@ class MemoryTokens(TensorStruct):
     ages: Tensor | None = None
     losses: dict[str, Tensor] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.losses = Labels(self.losses)  # rows of the tokens are rows of these
+
     def logged(self) -> dict[str, Tensor]:
         """The metrics under the names of a training's log, `memory/<name>`."""
         return {f"memory/{name}": value for name, value in self.metrics.items()}
@@ -282,7 +285,8 @@ class Batch(TensorStruct):
         Nothing attends to padding and nothing counts it, so the answer is the same and cheaper.
         Done where batches are made, on the CPU: the network itself never reads content.
         """
-        longest = int(self.prompt_mask.sum(1).max())
+        columns = torch.arange(1, self.prompt_mask.shape[1] + 1, device=self.prompt_mask.device)
+        longest = int((self.prompt_mask * columns).max())  # up to the last used one
         length = -(-longest // multiple) * multiple  # rounded up; slicing ends at the prompt's own
         return replace(
             self, prompt=self.prompt[:, :length], prompt_mask=self.prompt_mask[:, :length]

@@ -28,7 +28,7 @@ class Gist(Integration):
     def condition(self, memory: MemoryTokens | None) -> Callable[[Tensor], Tensor]:
         memory = required(memory)
         valid = memory.mask[..., None]
-        mean = memory.tokens.masked_fill(~valid, 0).sum(1) / valid.sum(1)
+        mean = memory.tokens.masked_fill(~valid, 0).sum(1) / valid.sum(1).clamp(min=1)
         change = self.to_condition(mean)  # once a chunk
         return lambda condition: condition + change
 

@@ -63,12 +63,13 @@ def map_frames(
     retained = np.asarray(keep, np.int64)
     for transform in transforms:
         start = int(np.searchsorted(real, exec_start))
-        counts = np.array(transform.repeats(len(real), start, rng), np.int64)
+        repeats = np.asarray(transform.repeats(len(real), start, rng))
+        counts = repeats.astype(np.int64)
         require(
-            counts.shape == real.shape and (counts >= 0).all(),
-            f"{type(transform).__name__}.repeats returned {counts.shape} numbers, the least"
-            f" {counts.min(initial=0)}: it must return one for each of {len(real)} frames, 0 or"
-            " more.",
+            counts.shape == real.shape and (counts >= 0).all() and (counts == repeats).all(),
+            f"{type(transform).__name__}.repeats returned {repeats.shape} numbers, the least"
+            f" {repeats.min(initial=0)}: it must return a whole number, 0 or more, for each of"
+            f" {len(real)} frames.",
         )
         last = np.searchsorted(real, retained, side="right") - 1
         counts[last] = np.maximum(counts[last], 1)

@@ -429,9 +429,9 @@ def choose_actions(
     policy.require_processor().require_stats()  # before the noise or memory of an episode changes
     batch = policy.observation(episodes)
     noise = stack_noise([episode.draw() for episode in episodes])
-    was_training = policy.training
     # `eval` itself takes milliseconds: it goes through a thousand modules and sets each.
-    if any(module.training for module in policy.modules()):
+    in_training = [module for module in policy.modules() if module.training]
+    if in_training:
         policy.eval()
     try:
         if sample_chunk is None:
@@ -440,8 +440,8 @@ def choose_actions(
             chunk = sample_chunk(batch, noise)
         chunk = chunk.float().cpu()
     finally:
-        if was_training:
-            policy.train()
+        for module in in_training:
+            module.training = True
     actions = executable_actions(policy, chunk, episodes)
     for episode, executed in zip(episodes, actions, strict=True):
         episode.acted(executed)

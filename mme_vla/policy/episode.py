@@ -106,6 +106,9 @@ class Episode:
         episode.__dict__.update(copy.deepcopy(self.__dict__, memo))
         return episode
 
+    def __copy__(self) -> Self:
+        return copy.deepcopy(self)  # two episodes share nothing but the policy
+
     def _motion_at(self, frames: Sequence[int] | np.ndarray) -> Tensor:
         return torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
 
@@ -144,7 +147,9 @@ class Episode:
         is_even = True
         for name in self._robot.camera_names:
             images[name] = self._checked_view(frames, name)
-            n_rendered = count if rendered is None else len(rendered[name])
+            n_rendered = count
+            if rendered is not None:
+                n_rendered = len(_checked_indices(rendered, name, count))
             if len(images[name]) != n_rendered:
                 is_even = False
         if states.shape != (count, width) or not is_even or demo.shape not in ((), (count,)):
@@ -344,13 +349,13 @@ class Episode:
             f"set_action_prefix() needs 1 to {space.horizon} actions of {space.width} numbers, got"
             f" shape {values.shape}.",
         )
-        is_count = isinstance(delay, int) and not isinstance(delay, bool)
+        is_count = isinstance(delay, int | np.integer) and not isinstance(delay, bool)
         require(
             is_count and 0 <= delay <= len(values),
             f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)},"
             " the actions given.",
         )
-        self.action_prefix = ActionPrefix(values, delay)
+        self.action_prefix = ActionPrefix(values.copy(), int(delay))
 
     def restart_clock(self) -> None:
         """Count the current frame as 0 again; what is remembered keeps its times.
@@ -381,7 +386,7 @@ class Episode:
         """Take the chunk [h, w] of the policy; the frames that follow show how much of it was
         executed.
         """
-        self._chunk = chunk
+        self._chunk = chunk.copy()  # the caller may change its own
         self._acted = True
         self.action_prefix = None
 
@@ -520,6 +525,20 @@ class Episode:
                 f" {array.shape}."
             )
         return array
+
+
+def _checked_indices(rendered: Mapping[str, np.ndarray], camera: str, count: int) -> np.ndarray:
+    """Which of `count` frames a camera shows."""
+    require(camera in rendered, f"rendered={sorted(rendered)} lacks the camera {camera!r}.")
+    indices = np.asarray(rendered[camera])
+    is_ascending = indices.ndim == 1 and (np.diff(indices) > 0).all()
+    is_inside = bool(((indices >= 0) & (indices < count)).all())
+    require(
+        is_ascending and is_inside,
+        f"rendered[{camera!r}]={brief(indices.tolist())} must be ascending numbers of frames from 0"
+        f" to {count - 1}.",
+    )
+    return indices
 
 
 def prefix_overlap(

@@ -14,6 +14,16 @@ from multiprocessing.connection import wait
 from mme_vla.errors import brief, require
 
 
+def check_main_guard() -> None:
+    """Raise an error in a worker process that imports the script whose workers it is one of."""
+    is_importing = getattr(multiprocessing.current_process(), "_inheriting", False)
+    require(
+        not is_importing,
+        "A worker process imports this script once more, and it starts workers again: keep what"
+        ' it does under `if __name__ == "__main__":`.',
+    )
+
+
 def end_with_parent() -> None:
     """Called first in a worker: it ends as soon as its parent is gone, even a killed one, and
     ignores Ctrl-C.

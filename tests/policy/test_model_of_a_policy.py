@@ -7,6 +7,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -19,6 +20,7 @@ from mme_vla import MMEPolicy, UserError
 from mme_vla.memory.base import stack_history
 from mme_vla.model import MMEModel, unit_images
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
+from mme_vla.types import MemoryTokens
 
 
 @pytest.fixture
@@ -121,6 +123,70 @@ def test_the_model_lists_the_calls_of_a_loss_in_their_order() -> None:
     listed = re.findall(r"^    ([\w.]+) +(?:here|\w+/\w+\.py): ", page, re.MULTILINE)
     assert len(listed) == 12
     assert listed == [name for name in called if name in listed]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("weight", torch.ones(2, 1), r"Batch\.weight has shape \[2, 1\]: it must be \[2\]"),
+        ("action_mask", torch.ones(2, 1).bool(), r"action_mask has shape \[2, 1\].*\[2, 20\]"),
+        ("time", torch.ones(1), r"noise 'time' has shape \[1\].* each of 2 samples"),
+        ("memory", slice(0, 1), r"tokens has shape \[1, 64, 64\].* each of 2 samples"),
+    ],
+)
+def test_rows_that_would_be_broadcast_are_refused(
+    policy: MMEPolicy, field: str, value: Any, says: str
+) -> None:
+    batch = random_batch(policy)
+    noise = policy.training_noise(2, torch.Generator().manual_seed(0))
+    memory = policy.model.memory_tokens(batch)
+    assert memory is not None
+    if field == "memory":
+        memory = memory.rows(value)
+    elif field == "time":
+        noise["time"] = value
+    else:
+        batch = replace(batch, **{field: value})
+    with pytest.raises(ValueError, match=says):
+        policy.model.loss(batch, noise, memory)
+
+
+def test_a_chunk_needs_noise_with_a_row_a_sample_and_a_step(policy: MMEPolicy) -> None:
+    batch = random_batch(policy, 1)
+    noise = policy.sampling_noise(torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=r"noise 'noise' has shape \[20, 32\]"):
+        policy.model.sample(batch, noise)
+    with pytest.raises(UserError, match="steps must be a positive whole number"):
+        policy.model.sample(batch, {"noise": noise["noise"][None]}, steps=0)
+
+
+def test_rows_of_memory_tokens_are_rows_of_their_losses() -> None:
+    memory = MemoryTokens(
+        torch.ones(3, 2, 4), torch.ones(3, 2).bool(), losses={"x": torch.arange(3)}
+    )
+    assert memory.rows(torch.tensor([2, 0])).losses["x"].tolist() == [2, 0]
+
+
+def test_words_of_a_prompt_that_is_padded_on_the_left_are_kept(policy: MMEPolicy) -> None:
+    batch = random_batch(policy)
+    batch.prompt_mask[:] = False
+    batch.prompt_mask[:, -10:] = True
+    cut = batch.without_prompt_padding()
+    assert cut.prompt_mask.sum() == 20
+    batch.prompt_mask[:] = False
+    batch.prompt_mask[:, 2:5] = True
+    assert batch.without_prompt_padding(4).prompt.shape[1] == 8
+
+
+def test_acting_leaves_every_module_in_its_mode(policy: MMEPolicy) -> None:
+    policy.train()
+    policy.backbone.eval()
+    modes = [module.training for module in policy.modules()]
+    episode = policy.start_episode("press the button")
+    frames = moving_frames(1)
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((1, 8), np.float32))
+    policy.act(episode)
+    assert [module.training for module in policy.modules()] == modes
 
 
 def test_a_model_without_a_transform_refuses_augmentation() -> None:

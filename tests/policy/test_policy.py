@@ -268,9 +268,47 @@ def test_copies_of_an_episode_share_its_policy_and_nothing_else(model):
     branch = copy.deepcopy(episode)
     assert branch.policy is policy
     assert (observed(branch) == observed(begun())).all()
+    assert (observed(copy.copy(episode)) == observed(begun())).all()
     assert (policy.act(episode) == policy.act(begun())).all()
     other, beside = copy.deepcopy([policy, episode])
     assert beside.policy is other is not policy
+
+
+def test_an_episode_keeps_what_its_caller_writes_over():
+    policy = small_policy("pi05", backbone=FEW_TOKENS, processor={"prompt": "past_actions"})
+    frames = moving_frames(4, size=policy.backbone.image_size)
+    views = {"front": frames, "wrist": frames}
+    states = np.zeros((4, 8), np.float32)
+    chunks = []
+    for writes in (False, True):
+        episode = policy.start_episode("press the button")
+        episode.observe(views, states)
+        chunk = policy.act(episode)
+        prefix = chunk[4:8].copy()
+        episode.set_action_prefix(prefix, np.int64(2))
+        if writes:
+            chunk[:] = prefix[:] = 9.0
+        episode.observe(views, states)
+        chunks.append(policy.act(episode))
+    assert (chunks[0] == chunks[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("rendered", "says"),
+    [
+        ({"front": [7], "wrist": [0]}, r"rendered\['front'\]=\[7\] must be ascending .* 0 to 2"),
+        ({"front": [1, 0], "wrist": [0, 1]}, "must be ascending"),
+        ({"front": [0]}, r"rendered=\['front'\] lacks the camera 'wrist'"),
+    ],
+)
+def test_indices_of_rendered_frames_that_cannot_be_are_refused(rendered, says):
+    policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
+    frames = moving_frames(3, size=policy.backbone.image_size)
+    views = {name: frames[: len(rendered.get(name, [0]))] for name in ("front", "wrist")}
+    episode = policy.start_episode("press the button")
+    with pytest.raises(UserError, match=says):
+        episode.observe(views, np.zeros((3, 8), np.float32), rendered=rendered)
+    assert episode.n_observed_frames == 0
 
 
 def test_an_episode_of_another_policy_is_refused():

@@ -32,7 +32,7 @@ from mme_vla.envs.rows import SceneOptions
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import SceneError, UserError, listed, require, text_of
-from mme_vla.utils.processes import signals_deferred
+from mme_vla.utils.processes import check_main_guard, signals_deferred
 
 
 @dataclass(frozen=True)
@@ -147,6 +147,7 @@ class VecEnv:
             type(workers) is int and workers >= 1,
             f"workers is {workers!r}; expected a positive integer.",
         )
+        check_main_guard()
         require(timeout > 0, f"timeout is {timeout!r}; expected a positive number of seconds.")
         self.jobs = deque(jobs)
         """Episodes that no worker has begun yet."""

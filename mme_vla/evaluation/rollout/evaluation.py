@@ -44,6 +44,7 @@ from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.utils import remove_drafts, safe_name
+from mme_vla.utils.processes import check_main_guard
 
 logger = logging.getLogger("mme_vla.evaluate")
 VIDEOS = "videos"
@@ -334,6 +335,7 @@ class EvaluationRun:
         """Run every episode that the folder has no result of yet, the longest first."""
         options = self.options
         # Refuse what can be refused, before the folder is claimed.
+        check_main_guard()
         self.policy.require_processor().require_stats()
         check_subgoals(self.policy, options.subgoals)
         if options.base is make_env:
