@@ -52,7 +52,7 @@ def test_a_list_of_memories_in_a_file_says_where_its_keys_are(tmp_path: Path) ->
     assert single == compose("policy", ["model=keyed"], extra_dirs=[tmp_path]).memory
     with pytest.raises(
         UserError,
-        match=r"'memory.budget=256'.*list \[framesamp, ttt\].*`/memory: joined`.*memory=\[",
+        match=r"'memory.budget=256'.*list \['framesamp', 'ttt'\].*`/memory: joined`.*memory=\[",
     ):
         compose("policy", ["model=both", "memory.budget=256"], extra_dirs=[tmp_path])
     for words in (["model=keyed"], ["model=framesamp_ttt_modul"], ["memory=[framesamp,ttt]"]):
