@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import ClassVar, NoReturn
 
 import hydra
-import yaml
 from hydra import version
 from hydra._internal.utils import _run_hydra, get_args_parser
 from hydra.core.hydra_config import HydraConfig
@@ -24,7 +23,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.cli.errors import MISTAKE, print_user_errors
 from mme_vla.cli.help import help_page
-from mme_vla.cli.table import commands
 from mme_vla.config import plugins
 from mme_vla.config.composition import (
     VERSION_BASE,
@@ -38,10 +36,9 @@ from mme_vla.config.composition import (
 from mme_vla.config.naming import join_memories, several_memories
 from mme_vla.config.override_errors import Names, badly_spaced, bare_word, paths, unknown_option
 from mme_vla.config.plugins import TRUST_FLAG
-from mme_vla.config.trees import config_dir, library_files, library_trees
+from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, printable, require
 from mme_vla.policy.run_folders import check_output, shipped_checkpoints
-from mme_vla.utils import read_text
 
 
 def run_configured(
@@ -152,11 +149,7 @@ def _checked_arguments(
         return args  # nothing of this tree is composed
     _check_bare_words(args.overrides, args.config_name or config_name, tree, extra)
     name = args.config_name or config_name
-    try:
-        composed = check_overrides(name, args.overrides, directory=tree, extra_dirs=extra)
-    except UserError as error:
-        hint = _other_commands(args.overrides, _names(name, tree, extra))
-        raise UserError(f"{error}{hint}") from None
+    composed = check_overrides(name, args.overrides, directory=tree, extra_dirs=extra)
     names_output = any(word.key_or_group == "output" for word in parse(args.overrides))
     for cfg in composed:
         # not resolved: Hydra knows what `${hydra:…}` means once the command runs
@@ -170,23 +163,6 @@ def _checked_arguments(
             if not OmegaConf.missing_keys(cfg):
                 pkgutil.resolve_name(check)(values)
     return args
-
-
-def _other_commands(words: Sequence[str], names: Names) -> str:
-    """A sentence on the keys of a command line that only other commands have; empty without any."""
-    files = library_files("")
-    text = ""
-    for word in words:
-        key = word.lstrip("+~").partition("=")[0]
-        if "." in key or key in names.keys or key in names.groups:
-            continue
-        users = []
-        for command, entry in commands().items():
-            if entry.config in files and key in yaml.safe_load(read_text(files[entry.config])):
-                users.append(f"mme-vla {command}")
-        if users:
-            text += f" {key!r} is a key of {', '.join(users)}."
-    return text
 
 
 def _names(config_name: str, tree: Path, extra_dirs: Sequence[Path]) -> Names:

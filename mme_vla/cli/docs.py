@@ -3,20 +3,20 @@ network.
 """
 
 import logging
-import shutil
 import tempfile
 import time
 import webbrowser
 from pathlib import Path
 
 from mme_vla.cli.help import argument_parser
-from mme_vla.errors import UserError, listed, missing_extra, require
+from mme_vla.config.naming import digest
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.utils import file_sum, read_json, write_json
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SETTINGS = REPOSITORY / "mkdocs.yml"
-FILES = ".mme-vla-site.json"
-"""Lies in a site, with the SHA-256 of each other file of it: what a later build may remove."""
+MARK = ".mme-vla-site.json"
+"""Lies in a site, with the SHA-256 of all the rest of it: what a later build may remove."""
 
 
 def build_site(output: Path) -> Path:
@@ -49,13 +49,11 @@ def build_site(output: Path) -> Path:
             config.plugins.on_shutdown()
         except (Abort, MkDocsException) as error:
             raise UserError(f"The site was not built: {error}") from error
-        sums = {}
-        for path in draft.rglob("*"):
-            if path.is_file():
-                sums[path.relative_to(draft).as_posix()] = file_sum(path)
-        write_json(draft / FILES, sums)
+        write_json(draft / MARK, {"sha256": _tree_sum(draft)})
         check_site(target)  # building takes a while
-        _replace(draft, target)
+        if target.exists():
+            target.rename(Path(place) / "earlier")
+        draft.rename(target)
     return output / "index.html"
 
 
@@ -64,51 +62,37 @@ def check_site(folder: Path) -> None:
     there.
 
     Raises:
-        UserError: files or folders in it are not of a site that was built here, or were changed
-            since.
+        UserError: it is not exactly what was built.
     """
     require(
         not folder.exists() or folder.is_dir(),
         f"--output {folder} is a file: give a folder for the site.",
     )
-    record = folder / FILES
-    sums = read_json(record, "the files of a site") if record.is_file() else {}
-    folders: set[str] = set()
-    for name in sums:
-        folders.update(parent.as_posix() for parent in Path(name).parents)
-    other_files: list[str] = []
-    for path in folder.rglob("*"):
-        name = path.relative_to(folder).as_posix()
-        if path.is_symlink():
-            is_generated = False
-        elif path.is_dir():
-            is_generated = name in folders
-        else:
-            is_generated = name == FILES or (name in sums and file_sum(path) == sums[name])
-        if not is_generated:
-            other_files.append(path.name)
-        if len(other_files) == 5:  # not all of them: the folder may be a home folder
-            break
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    mark = folder / MARK
+    is_site = False
+    if mark.is_file():
+        is_site = read_json(mark, "the digest of a site").get("sha256") == _tree_sum(folder)
     require(
-        not other_files,
-        f"--output {folder} holds what is no site of this command, or was changed since, such as"
-        f" {listed(sorted(other_files))}. A new site replaces the whole folder: choose another, or"
-        " remove this one yourself.",
+        is_site,
+        f"--output {folder} holds what is no site of this command, or was changed since. A new site"
+        " replaces the whole folder: choose another, or remove this one yourself.",
     )
 
 
-def _replace(draft: Path, target: Path) -> None:
-    """Move a built site into the folder of an earlier one; at each moment its list names all that
-    is there.
+def _tree_sum(folder: Path) -> str:
+    """SHA-256 of the names of all files and folders in a folder, and of what the files hold, but
+    for the mark.
     """
-    target.mkdir(exist_ok=True)
-    for path in sorted(target.iterdir(), key=lambda path: path.name == FILES):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-    for path in sorted(draft.iterdir(), key=lambda path: path.name != FILES):
-        shutil.move(path, target / path.name)
+    entries = {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink() or not path.is_file():
+            entries[name] = "link" if path.is_symlink() else "folder"
+        elif name != MARK:
+            entries[name] = file_sum(path)
+    return digest(entries, 64)
 
 
 def main() -> None:

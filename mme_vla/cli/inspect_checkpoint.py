@@ -13,11 +13,9 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import numbered
 from mme_vla.errors import counted, printable
 from mme_vla.policy.base import Policy
-from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint
+from mme_vla.policy.run_folders import STATE, resolve_checkpoint
 from mme_vla.policy.sections import PolicySections
 from mme_vla.training.checkpoint import read_state
-from mme_vla.training.runs import SUMMARY
-from mme_vla.utils import read_json
 
 
 def show_checkpoint(
@@ -35,7 +33,7 @@ def show_checkpoint(
     console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
     state = read_state(folder) if (folder / STATE).is_file() else None
     grid = Table.grid(padding=(0, 2))
-    for row in [*summary_rows(policy), *training_rows(policy, folder, state)]:
+    for row in [*summary_rows(policy), *training_rows(policy, state)]:
         grid.add_row(*map(printable, row))
     console.print(grid, highlight=False)
     if everything:
@@ -80,10 +78,8 @@ def summary_rows(policy: Policy) -> list[tuple[str, str]]:
     ]
 
 
-def training_rows(
-    policy: Policy, folder: Path, state: Mapping[str, Any] | None
-) -> list[tuple[str, str]]:
-    """What is known of a checkpoint's training: data, steps, and errors.
+def training_rows(policy: Policy, state: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """What is known of a checkpoint's training: data, steps, and error.
 
     state: of the training, where the checkpoint has it.
     """
@@ -100,30 +96,8 @@ def training_rows(
     if action_offset_of(policy):
         known += f", action_offset={action_offset_of(policy)}"
     error = _summary(card.get("results") or "not recorded")
-    rows = [("data", known), ("training", steps), ("error", error)]
-    check = _open_loop_of(folder)
-    if check is not None:
-        rows.append(("open loop", f"{check.get('episode', 'an episode')}. {check['verdict']}"))
-    else:
-        rows.append(
-            ("open loop", "not recorded; mme-vla inspect checkpoint=… dataset=… compares actions")
-        )
-    return rows
-
-
-def _open_loop_of(folder: Path) -> Mapping[str, Any] | None:
-    """The open-loop check of a finished run, if this is its last checkpoint."""
-    if len(folder.parents) < 2:
-        return None
-    path = folder.parents[1] / SUMMARY
-    if folder.parent.name != CHECKPOINTS or not path.is_file():
-        return None
-    summary = read_json(path, "the summary of a run")
-    check = summary.get("open_loop")
-    is_last = Path(str(summary.get("checkpoint", ""))).name == folder.name
-    if not is_last or not isinstance(check, Mapping) or "verdict" not in check:
-        return None
-    return check
+    error += "; mme-vla inspect checkpoint=… dataset=… compares actions"
+    return [("data", known), ("training", steps), ("error", error)]
 
 
 def show_details(policy: Policy, state: Mapping[str, Any] | None, console: Console) -> None:

@@ -9,16 +9,15 @@ import math
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
-from mme_vla.errors import UserError, listed, require
+from mme_vla.errors import UserError, counted, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
@@ -31,68 +30,49 @@ from mme_vla.weights.writers import check_target, write_policy
 
 def print_mapping(policy: Policy, source: Source, to: str) -> None:
     """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered
-    layers are one row.
+    layers are one line.
     """
-    console = Console(width=None if sys.stdout.isatty() else 200)
     names = formats()
-    console.print(
-        f"{source.folder} ({names[source.format]}) → {names[to]}; every tensor fits.",
-        soft_wrap=True,
-    )
+    print(f"{source.folder} ({names[source.format]}) → {names[to]}; every tensor fits.")
     sides = {source.format: "read", to: "written"}
     sides.pop("ours", None)
     if not sides:
-        console.print("Both sides have the same names.")
+        print("Both sides have the same names.")
     for fmt, title in sides.items():
-        _print_adapter(console, adapter_of(fmt, policy), policy, title)
+        adapter = adapter_of(fmt, policy)
+        print(f"{title}: {len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours")
+        for heading, lines in _lists(adapter, policy).items():
+            print(f"{title}, {heading}:" if lines else f"{title}, {heading}: none")
+            for line in lines:
+                print(f"  {line}")
 
 
-def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: str) -> None:
-    state = policy.state_dict()
-    shapes = adapter.shapes(state)
-    rows: dict[tuple[str, ...], int] = {}
+def _lists(adapter: Adapter, policy: Policy) -> dict[str, list[str]]:
+    """Heading → lines."""
+    shapes = adapter.shapes(policy.state_dict())
+    mapped: Counter[str] = Counter()
     for target, pieces in adapter.table.items():
         for piece in pieces:
-            # A pattern with the same two sides only says how many rows there are.
+            line = f"{_starred(piece.path)} [{_shape(shapes[piece.path])}] → {_starred(target)}"
+            # A pattern with the same two sides only says how many axes there are.
             left, _, right = piece.pattern.partition("->")
-            layout = "" if left.strip() == right.strip() else piece.pattern
-            cells = (_starred(piece.path), _shape(shapes[piece.path]), layout, _starred(target))
-            rows[cells] = rows.get(cells, 0) + 1
-    counts = f"{len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours"
-    _print_list(
-        console,
-        f"{title}: {counts}",
-        [(*row, str(count)) for row, count in rows.items()],
-        ("theirs", "shape", "layout", "ours", "tensors"),
-    )
-    gaps = []
+            if left.strip() != right.strip():
+                line += f" by {piece.pattern}"
+            mapped[line] += 1
+    unread = []
     for gap in adapter.unread:
         part = "whole" if gap.layer is None else f"layer {gap.layer}"
-        gaps.append((gap.path, part, _shape(gap.shape), str(math.prod(gap.shape))))
-    about = "no action depends on them (dropped when read, zeros when written)"
-    _print_list(
-        console, f"{title}, unread: {about}", gaps, ("tensor", "part", "shape", "parameters")
-    )
-    _print_list(console, f"{title}, tied: copies", adapter.tied.items(), ("tensor", "is"))
+        size = counted(math.prod(gap.shape), "parameter")
+        unread.append(f"{gap.path}, {part} [{_shape(gap.shape)}], {size}")
     derived = []
     for constant in adapter.derived:
-        derived.append((constant.path, _shape(tuple(constant.make().shape))))
-    _print_list(console, f"{title}, derived: recomputed constants", derived, ("tensor", "shape"))
-
-
-def _print_list(
-    console: Console, title: str, rows: Iterable[tuple[str, ...]], columns: tuple[str, ...]
-) -> None:
-    rows = list(rows)
-    if not rows:
-        console.print(f"{title}: none")
-        return
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
+        derived.append(f"{constant.path} [{_shape(tuple(constant.make().shape))}]")
+    return {
+        "mapped": [f"{line}, {counted(count, 'tensor')}" for line, count in mapped.items()],
+        "unread (no action depends on them: dropped when read, zeros when written)": unread,
+        "tied (copies)": [f"{name} is {copied}" for name, copied in adapter.tied.items()],
+        "derived (recomputed constants)": derived,
+    }
 
 
 def _starred(name: str) -> str:

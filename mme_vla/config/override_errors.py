@@ -18,7 +18,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mme_vla.errors import UserError, did_you_mean, missing_extra
+from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
 
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError)
 _BAD_KEY = re.compile(
@@ -86,7 +86,12 @@ class ConfigTree:
         members = defaults.get("memory")
         for override in self.values:
             if isinstance(members, list) and override.key_or_group.startswith("memory."):
-                return _keys_of_a_list(str(override.input_line), members)
+                return (
+                    f"{override.input_line!r}: the model's file gives memory as the list"
+                    f" {brief(members)}, without keys. In that file write `/memory: joined` under"
+                    " defaults and `memory: {members: […]}` for the same memory with keys. Or"
+                    " choose it on the command line, memory=[…], for a model with a memory."
+                )
         unknown = _BAD_KEY.match(text)
         if unknown is None:
             return text
@@ -135,20 +140,6 @@ def nearby_file(group: str, name: str) -> Path | None:
         if files:
             return files[0]
     return None
-
-
-def _keys_of_a_list(word: str, members: Sequence[Any]) -> str:
-    """The message for `memory.budget=…` where a model's file gives memory as a list."""
-    names = []
-    for member in members:
-        names.append(str(member.get("name") if isinstance(member, Mapping) else member))
-    listing = ", ".join(names)
-    return (
-        f"{word!r}: the model's file gives memory as the list [{listing}], without keys. In that"
-        f" file write `/memory: joined` under defaults and `memory: {{members: [{listing}]}}`: the"
-        " same memory with keys. Or choose it on the command line,"
-        f" memory=[{','.join(names)}], for a model with a memory."
-    )
 
 
 def _expected(default: Any, value: Any) -> str:

@@ -6,8 +6,8 @@ import fcntl
 import os
 import time
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import KW_ONLY, asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -399,26 +399,6 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
         if supersedes:
             merged[at] = new
     return list(merged.values())
-
-
-def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
-    """Give records without a digest the one that others of their run have; only for the records of
-    one folder.
-
-    A run that was begun before records had digests, and ended after, is one run. Where a run's
-    other records have none, or several, nothing is assumed.
-    """
-    digests: dict[RunKey, set[str]] = {}
-    for record in records:
-        if record.composition is not None:
-            digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
-    completed = []
-    for record in records:
-        of_run = digests.get(record.run, set())
-        if record.composition is None and len(of_run) == 1:
-            record = replace(record, composition=next(iter(of_run)))
-        completed.append(record)
-    return completed
 
 
 def check_settings(records: Iterable[EpisodeRecord]) -> None:

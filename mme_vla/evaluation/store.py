@@ -12,11 +12,7 @@ from typing import Any
 
 from mme_vla.config.naming import digest, flat
 from mme_vla.errors import UserError, brief, require
-from mme_vla.evaluation.records import (
-    EpisodeRecord,
-    complete_compositions,
-    read_records,
-)
+from mme_vla.evaluation.records import EpisodeRecord, read_records
 from mme_vla.utils import (
     draft_of,
     is_draft,
@@ -159,14 +155,8 @@ RECORDS = "episodes.jsonl"  # Name of a run's file; its shards are called `episo
 
 
 def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
-    """Read files of records; those of one folder belong together (`complete_compositions`)."""
-    folders: dict[Path, list[EpisodeRecord]] = {}
-    for path in paths:
-        folders.setdefault(path.resolve().parent, []).extend(read_records(path))
-    completed = []
-    for records in folders.values():
-        completed += complete_compositions(records)
-    return completed
+    """Read files of records, such as `find_records` finds."""
+    return [record for path in paths for record in read_records(path)]
 
 
 def find_records(paths: Iterable[Path]) -> list[Path]:

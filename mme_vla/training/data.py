@@ -24,8 +24,8 @@ from mme_vla.data.sources import (
     open_sources,
     split_episodes,
 )
-from mme_vla.data.statistics import check_ranges, compute_norm_stats
-from mme_vla.errors import UserError, counted, require
+from mme_vla.data.statistics import compute_norm_stats
+from mme_vla.errors import counted, require
 from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.base import Policy
 from mme_vla.policy.sections import PolicySections
@@ -92,7 +92,7 @@ def prepare_data(
     if stats_from is None:
         processor.stats = compute_statistics(policy, data, sources, split, seed)
     else:
-        processor.stats = read_statistics(stats_from, policy, data, sources, split)
+        processor.stats = NormStats.load(checked_file(stats_from, STATS_FILE))
     caches = None
     if policy.memory is not None:
         # Each dataset's is built first where it is missing and small enough.
@@ -174,47 +174,6 @@ def compute_statistics(
         video=spec.video,
         narrow=narrow,
     )
-
-
-def read_statistics(
-    folder: Path,
-    policy: Policy,
-    data: DataSettings,
-    sources: list[EpisodeSource],
-    split: Split,
-) -> NormStats:
-    """The statistics of a checkpoint, once the training split lies within them.
-
-    Raises:
-        UserError: numbers of the split lie far beyond; a run's statistics stay what they are to its
-            end, so `narrow_ranges=widen` cannot help.
-    """
-    processor = policy.require_processor()
-    spec = processor.stats_spec
-    stats = NormStats.load(checked_file(folder, STATS_FILE))
-    narrow = "refuse"
-    if spec.bounds == "extremes":
-        narrow = "ignore"
-    elif data.narrow_ranges == "warn":
-        narrow = "warn"
-    try:
-        check_ranges(
-            stats,
-            sources,
-            split.train,
-            spec.horizon or processor.embodiment.action.horizon,
-            data.action_offset,
-            policy.embodiment,
-            spec.video,
-            narrow,
-        )
-    except UserError as error:
-        raise UserError(
-            f"{folder / STATS_FILE}, the statistics that this run began with: {error} In a"
-            " run that is resumed they stay as they are: begin a new one with that and"
-            f" init_from={folder}, or continue with data.narrow_ranges=warn."
-        ) from None
-    return stats
 
 
 def _samples(

@@ -58,8 +58,8 @@ MAY_DIFFER = (
 changes a loss.
 
 The name is a label alone. `data.content` and `data.side_files`, digests of the datasets, are
-compared when they are open (`check_content`). A run's statistics stay what they are:
-`data.narrow_ranges` decides only whether it continues with narrow ones.
+compared when they are open (`check_content`). A run's statistics stay what they are, whatever
+`data.narrow_ranges` says.
 """
 
 

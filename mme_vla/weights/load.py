@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from mme_vla.policy.tensor_files import (
 )
 from mme_vla.processing.base import CONFIG_FILE, read_settings
 from mme_vla.weights.ports import check_window, port_adapter
-from mme_vla.weights.released import members_of, partial_adapter, released_adapter
+from mme_vla.weights.released import partial_adapter, released_adapter
 from mme_vla.weights.source import Source, method_formats, open_source
 from mme_vla.weights.statistics import read_stats, stats_files
 from mme_vla.weights.tables import Adapter, memory_parameters
@@ -205,13 +205,12 @@ def _match_foreign(
     else:
         adapter = adapter_of(checkpoint.format, policy)
     local = memory_parameters(policy) | adapter.fresh
-    members = [place for place, _ in members_of(policy.memory)]
 
     def split(tensors: Mapping[str, Tensor]) -> tuple[Adapter, dict[str, Tensor], list[str]]:
         """The part of the name table that these tensors can fill, those of it, and what is left
         behind.
         """
-        reduced = _reduced(adapter, local, members, tensors)
+        reduced = _reduced(adapter, local, tensors)
         if adapter.of_memory is None:
             return reduced, dict(tensors), []
         known = {constant.path for constant in adapter.derived} | set(reduced.shapes(state))
@@ -233,23 +232,11 @@ def _match_foreign(
     return reduced.translate(named, state, source), left
 
 
-def _reduced(
-    adapter: Adapter, local: set[str], members: Sequence[str], source_tensors: Mapping[str, Tensor]
-) -> Adapter:
-    """Leave out the memory's parameters that the checkpoint does not hold, and members that it does
-    not hold whole.
-    """
-    absent = set()
-    for name, pieces in adapter.table.items():
-        if not all(piece.path in source_tensors for piece in pieces):
-            absent.add(name)
-    incomplete = []
-    for member in members:
-        if any(name.startswith(f"{member}.") for name in absent):
-            incomplete.append(f"{member}.")
+def _reduced(adapter: Adapter, local: set[str], source_tensors: Mapping[str, Tensor]) -> Adapter:
+    """Leave out the memory's parameters that the checkpoint does not hold."""
     table = {}
     for name, pieces in adapter.table.items():
-        is_present = name not in absent and not name.startswith(tuple(incomplete))
+        is_present = all(piece.path in source_tensors for piece in pieces)
         if is_present or name not in local:
             table[name] = pieces
     return replace(adapter, table=table)

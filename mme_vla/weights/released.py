@@ -13,8 +13,6 @@ import mme_vla.weights.names.jax_backbone as backbone_names
 import mme_vla.weights.names.jax_integration as integration_names
 import mme_vla.weights.names.jax_memory as memory_names
 from mme_vla.errors import UserError, listed
-from mme_vla.memory.base import Memory
-from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.weights.tables import (
     Adapter,
@@ -42,32 +40,15 @@ def released_adapter(policy: MMEPolicy) -> Adapter:
 def partial_adapter(policy: Any) -> Adapter:
     """The released tree as far as it has names for this policy: what parts of one's own have beyond
     it is left out.
-
-    Members of a joined memory have the names that each would have alone: a reader keeps those that
-    are there whole.
     """
     state = policy.state_dict()
-    table = _table(policy)
-    unread = released_unread(policy)
-    derived = released_derived(policy)
-    for place, member in members_of(policy.memory):
-        table |= prefixed(place, memory_names.released_names(member))
-        unread += memory_names.released_unread(member)
-        derived += memory_names.released_derived(member)
     known = {}
-    for name, pieces in table.items():
+    for name, pieces in _table(policy).items():
         if name in state or policy.finetune_spec.component_of(name) != "memory":
             known[name] = pieces
-    return Adapter(known, unread, derived=derived, of_memory=OF_MEMORY)
-
-
-def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
-    """The members of a joined memory, each with the beginning of its tensors' names in
-    the policy.
-    """
-    if not isinstance(memory, JoinedMemory):
-        return []
-    return [(f"memory.members.{i}", member) for i, member in enumerate(memory.memories)]
+    return Adapter(
+        known, released_unread(policy), derived=released_derived(policy), of_memory=OF_MEMORY
+    )
 
 
 def released_table(policy: MMEPolicy) -> NameTable:

@@ -211,7 +211,7 @@ def test_draft_trains_and_the_checkpoint_is_checked_open_loop(
     main(compose("inspect", ["dataset=squid"]))
     words = [
         "embodiment=squid", "model=framesamp_modul", "data=lerobot", "data.sources=[squid]",
-        "data.val_episodes=[1]", "train.steps=1", "train.batch_size=2", "train.val_samples=0",
+        "data.val_episodes=[1]", "train.steps=1", "train.batch_size=2", "train.val_samples=2",
         "train.workers=0", "train.device=cpu", "logger=none", "output=run", "backbone.depth=1",
     ]  # fmt: skip
     cfg = compose("train", words, extra_dirs=[squid / "outputs" / "inspect"])
@@ -230,7 +230,7 @@ def test_draft_trains_and_the_checkpoint_is_checked_open_loop(
     main(compose("inspect", ["checkpoint=run"]))
     printed = " ".join(capsys.readouterr().out.split())
     assert "squid: cameras top" in printed and "1 of 1 updates" in printed
-    assert "held-out episode 1 of squid" in printed, "the check at the end of training"
+    assert "error validation loss=" in printed and "dataset=… compares actions" in printed
 
     with pytest.raises(UserError, match=r"step=3 draws .* add episode="):
         main(compose("inspect", ["checkpoint=run", "dataset=squid", "step=3"]))

@@ -53,7 +53,7 @@ def reply(
         ("results verify", "A value is needed for receipt (receipt: receipt.json, or a folder"),
         ("docs --biuld", "There is no option '--biuld'. Did you mean '--build'?"),
         ("docs --output", "--output needs one value."),
-        ("evaluate with=[drop:all]", "'with' is a key of mme-vla probe."),
+        ("evaluate with=[drop:all]", "Unknown config key 'with'. Known: backbone,"),
         ("evaluate checkpoint=missing", "No checkpoint at missing: there is no such folder."),
         ("evaluate checkpoint=outputs/missing", "No checkpoint at outputs/missing: there is no"),
         ("probe checkpoint=nano with=[dropall] recordings=sample", "Did you mean 'drop'?"),

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from mme_vla.config.composition import compose
-from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
+from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.store import read_folders
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.saving import composition_digest
 
@@ -90,18 +89,3 @@ def test_records_of_earlier_versions_load_and_stay_apart_from_new_ones(tmp_path:
     ]
     alone = aggregate(mixed[:2], Protocol(("BinFill",), 2))
     assert [m.label for m in alone.methods] == ["tokendrop_expert"]
-
-
-def test_a_run_begun_before_there_were_digests_is_one_run(tmp_path: Path) -> None:
-    for name, digest in (
-        ("episodes-0of2.jsonl", record(0, True)),
-        ("episodes-1of2.jsonl", record(1, True, composition="d" * 12)),
-    ):
-        (tmp_path / name).write_text(digest.to_json() + "\n")
-    assert {r.composition for r in read_folders(sorted(tmp_path.glob("*.jsonl")))} == {"d" * 12}
-    two = [
-        record(0, True),
-        record(1, True, composition="d" * 12),
-        record(2, True, composition="e" * 12),
-    ]
-    assert complete_compositions(two)[0].composition is None

@@ -150,9 +150,7 @@ def test_training_refuses_unless_told_to_widen(tmp_path: Path) -> None:
         prepare_data(policy, training_data(root, narrow_ranges="wide"), seed=1)
 
 
-def test_statistics_that_a_run_stored_are_compared_with_its_data_when_it_is_resumed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_statistics_that_a_run_stored_stay_when_it_is_resumed(tmp_path: Path) -> None:
     from mme_vla.processing.base import STATS_FILE
     from mme_vla.testing.small import small_policy
     from mme_vla.training.data import prepare_data
@@ -162,23 +160,11 @@ def test_statistics_that_a_run_stored_are_compared_with_its_data_when_it_is_resu
     prepare_data(policy, training_data(root), seed=1)
     stats = processor.stats
     assert stats is not None
+    stats.actions.q99[0] += 0.5
     stats.save(tmp_path / STATS_FILE)
-    prepare_data(policy, training_data(root), seed=1, stats_from=tmp_path)
-    assert processor.stats is not None and processor.stats.to_dict() == stats.to_dict()
-
-    stats.actions.q01[0], stats.actions.q99[0] = -1e-6, 1e-6
-    stats.save(tmp_path / STATS_FILE)
-    for narrow in (None, "widen"):
-        with pytest.raises(
-            UserError, match=rf"{STATS_FILE}.*joint 1 of the action.*begin a new one .*init_from="
-        ) as refused:
-            prepare_data(
-                policy, training_data(root, narrow_ranges=narrow), seed=1, stats_from=tmp_path
-            )
-    assert len(str(refused.value)) < 2000
-    prepare_data(policy, training_data(root, narrow_ranges="warn"), seed=1, stats_from=tmp_path)
-    assert "become numbers in the hundreds to millions" in caplog.text
-    assert processor.stats.actions.q99[0] == 1e-6
+    for narrow in (None, "widen", "warn"):
+        prepare_data(policy, training_data(root, narrow_ranges=narrow), seed=1, stats_from=tmp_path)
+        assert processor.stats is not None and processor.stats.to_dict() == stats.to_dict()
 
 
 def test_the_recipe_of_a_training_names_widening_and_stays_what_it_was_without() -> None:

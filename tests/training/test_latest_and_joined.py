@@ -1,6 +1,4 @@
-"""`latest` is understood wherever weights are opened, and several memories take what a release or a
-command says.
-"""
+"""`latest` is understood wherever weights are opened, and joined memories read their options."""
 
 from pathlib import Path
 
@@ -15,8 +13,6 @@ from mme_vla.testing.small import small_policy
 from mme_vla.weights import transfer
 from mme_vla.weights.released import to_released
 from mme_vla.weights.source import open_source
-
-TTT = {"name": "ttt", "hidden": 16}
 
 
 @pytest.fixture
@@ -56,7 +52,7 @@ def test_a_list_of_memories_in_a_file_says_where_its_keys_are(tmp_path: Path) ->
     assert single == compose("policy", ["model=keyed"], extra_dirs=[tmp_path]).memory
     with pytest.raises(
         UserError,
-        match=r"'memory.budget=256'.*list \[framesamp, ttt\].*`/memory: joined`.*memory=\[",
+        match=r"'memory.budget=256'.*list \['framesamp', 'ttt'\].*`/memory: joined`.*memory=\[",
     ):
         compose("policy", ["model=both", "memory.budget=256"], extra_dirs=[tmp_path])
     for words in (["model=keyed"], ["model=framesamp_ttt_modul"], ["memory=[framesamp,ttt]"]):
@@ -66,25 +62,22 @@ def test_a_list_of_memories_in_a_file_says_where_its_keys_are(tmp_path: Path) ->
         ), words
 
 
-@pytest.mark.parametrize(("released", "place"), [("ttt_modul", 1), ("framesamp_modul", 0)])
-def test_a_joined_memory_takes_the_member_that_a_released_run_holds(
-    released: str, place: int, tmp_path: Path
+@pytest.mark.parametrize("released", ["ttt_modul", "framesamp_modul"])
+def test_a_joined_memory_starts_anew_beside_a_released_network(
+    released: str, tmp_path: Path
 ) -> None:
-    alone = small_policy(released, seed=1, **({"memory": {"hidden": 16}} if place else {}))
+    alone = small_policy(released, seed=1)
     save_file(
         {k: v.contiguous() for k, v in to_released(alone).items()}, tmp_path / "model.safetensors"
     )
-    members = ["framesamp", TTT]
-    joined = small_policy("framesamp_ttt_modul", seed=2, memory={"members": members})
+    joined = small_policy("framesamp_ttt_modul", seed=2)
     before = {name: value.clone() for name, value in joined.state_dict().items()}
     start = transfer(joined, tmp_path)
-    after, other_state = joined.state_dict(), alone.memory.state_dict()
-    for name, value in other_state.items():
-        assert torch.equal(after[f"memory.members.{place}.{name}"], value), name
-    other = [name for name in after if name.startswith(f"memory.members.{1 - place}.")]
-    assert other and all(torch.equal(after[name], before[name]) for name in other), (
-        "the other one stays as it was"
-    )
-    assert set(start.new) == set(other) and start.left == []
+    after, network = joined.state_dict(), alone.state_dict()
+    members = [name for name in after if name.startswith("memory.members.")]
+    assert start.new == sorted(members) and set(start.taken) == set(after) - set(members)
+    assert all(torch.equal(after[name], before[name]) for name in members)
+    assert all(torch.equal(after[name], network[name]) for name in start.taken)
+    assert start.left and all("mem_" in name for name in start.left)
     with pytest.raises(UserError, match=r"JoinedMemory .*start_from\(\)"):
         load_weights(joined, tmp_path)

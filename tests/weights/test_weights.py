@@ -3,6 +3,7 @@ foreign weights.
 """
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,20 @@ def test_a_destination_is_never_overwritten_and_a_failure_leaves_nothing(
     with pytest.raises(UserError, match="memoryless"):
         convert(tmp_path / "memory", tmp_path / "new", to="openpi")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["memory", "there"]
+
+
+def test_a_dry_run_prints_the_mapping_and_makes_no_folder(
+    bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    convert(bases["openpi"], tmp_path / "none", ["backbone=tiny"], to="lerobot", dry_run=True)
+    printed = capsys.readouterr().out
+    assert not (tmp_path / "none").exists()
+    assert "openpi" in printed.splitlines()[0] and "every tensor fits" in printed.splitlines()[0]
+    for side in ("read", "written"):
+        for heading in ("mapped", "unread", "tied", "derived"):
+            assert f"\n{side}, {heading}" in printed
+    assert re.search(r"\n  \S*action_in_proj.weight \[\S+\] → backbone.action_in.weight,", printed)
+    assert re.search(r"\n  \S+layers\.\*\S+ \[\S+\] → \S+layers\.\*\S+, \d+ tensors\n", printed)
 
 
 def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
-from itertools import islice
 from typing import Any
 from weakref import WeakSet
 
@@ -42,7 +41,7 @@ from mme_vla.utils import safe_name
 
 LARGEST_ACTION = 1e4
 """Largest size of a number of an action: radians, metres and shares are far below."""
-_MOST_ENTRIES = 64  # of a list or map of a server's metadata, in a receipt
+_LONGEST_METADATA = 4000  # characters of a server's metadata, in a receipt
 _MS_KEYS = ("infer_ms", "infer_time_ms")
 """Where servers say how long they computed: openpi's in `server_timing`, RoboMME's beside the
 actions.
@@ -266,7 +265,7 @@ class RemotePolicy(Policy):
         self._server: dict[str, Any] = {
             "address": choice.server,
             "protocol": name,
-            "metadata": json_value(self.metadata),
+            "metadata": brief(self.metadata, _LONGEST_METADATA),
         }
         self.info = PolicyInfo(
             sample_steps=count_of(metadata.sample_steps) or 1,
@@ -478,21 +477,3 @@ def _identity(choice: ServerChoice, protocol: str, metadata: ServerMetadata) -> 
             identity.training,
         )
     return PolicyIdentity(connection.name or protocol, connection.checkpoint or "served")
-
-
-def json_value(value: Any, depth: int = 4) -> Any:
-    """A server's metadata as JSON has it: texts, numbers, lists and maps; of others their text."""
-    if value is None or isinstance(value, bool | int):
-        return value
-    if isinstance(value, str):
-        return brief(value, 400, quote=False)
-    if isinstance(value, float):
-        return value if np.isfinite(value) else str(value)
-    if depth and isinstance(value, Mapping):
-        entries = islice(value.items(), _MOST_ENTRIES)
-        return {
-            brief(str(key), 80, quote=False): json_value(one, depth - 1) for key, one in entries
-        }
-    if depth and isinstance(value, list | tuple):
-        return [json_value(one, depth - 1) for one in value[:_MOST_ENTRIES]]
-    return brief(value, 200)

@@ -22,13 +22,6 @@ if TYPE_CHECKING:
 
 
 MODEL = "Qwen/Qwen3-VL-4B-Instruct"
-ENVIRONMENT = {
-    "IMAGE_MAX_TOKEN_NUM": "256",
-    "VIDEO_MAX_TOKEN_NUM": "64",
-    "FPS_MAX_FRAMES": "10",
-    "QWENVL_BBOX_FORMAT": "legacy",  # points between <|box_start|> and <|box_end|>
-    "NPROC_PER_NODE": "4",
-}
 _ARGUMENTS = {
     "model": MODEL,
     "train_type": "lora",  # of ms-swift 3.9 and later 3.x; version 4 calls it tuner_type
@@ -59,12 +52,6 @@ def write_arguments(folder: Path, name: str) -> Path:
     arguments = {**_ARGUMENTS, "dataset": [f"{name}.jsonl"], "output_dir": f"swift_{name}"}
     path.write_text(json.dumps(arguments, indent=1) + "\n")
     return path
-
-
-def command(name: str) -> str:
-    """Return the command of ms-swift that trains with `write_arguments`."""
-    variables = [f"{key}={value}" for key, value in ENVIRONMENT.items()]
-    return " ".join([*variables, "swift sft", f"swift_{name}.json"])
 
 
 # All linear layers of the language model; the vision tower and the merger stay as they are.

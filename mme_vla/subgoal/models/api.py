@@ -16,7 +16,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import SplitResult, unquote, urlsplit
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -70,44 +70,28 @@ class Settings:
         )
         if self.base_url is None:
             return
+        # Messages, logs and the client's errors name the address; this message does not.
+        require(
+            "@" not in self.base_url,
+            "base_url=… holds a user or a password, which messages would name: write"
+            " http://host:port/path alone, and set the environment variable that key_variable names"
+            " to the key.",
+        )
         try:
             scheme = urlsplit(self.base_url).scheme
         except ValueError:  # brackets that hold no address
             scheme = ""
-        if scheme not in ("http", "https"):
-            visible = self.base_url.rpartition("@")[2]  # without a password
-            raise UserError(
-                f"base_url={brief(visible)} must be an address such as http://127.0.0.1:8000/v1, or"
-                " null."
-            )
-
-    @property
-    def address(self) -> SplitResult:
-        return urlsplit(self.base_url or "")
+        require(
+            scheme in ("http", "https"),
+            f"base_url={brief(self.base_url)} must be an address such as http://127.0.0.1:8000/v1,"
+            " or null.",
+        )
 
     @property
     def key(self) -> str:
         if self.key_variable is None:
             return ""
         return os.environ.get(self.key_variable, "")
-
-    @property
-    def login(self) -> str:
-        """`user:password` of an address that has them, else empty."""
-        user, password = self.address.username, self.address.password
-        if not user and not password:
-            return ""
-        return f"{unquote(user or '')}:{unquote(password or '')}"
-
-    @property
-    def secrets(self) -> list[str]:
-        """What no message, log or file may hold, the longest first.
-
-        These are the key, and the login of the address: itself, as it is sent, and its password.
-        """
-        login = self.login
-        candidates = [self.key, login, _base64(login.encode()), login.partition(":")[2]]
-        return sorted(filter(None, candidates), key=len, reverse=True)
 
 
 PROVIDERS = {
@@ -278,11 +262,11 @@ class Api:
         return brief(line, _LONGEST_REASON, quote=False)
 
     def _redact(self, text: str, shortest: int = 1) -> str:
-        """Replace the secrets of at least `shortest` characters."""
-        for secret in self.settings.secrets:
-            if len(secret) >= shortest:
-                text = text.replace(secret, "***")
-        return text
+        """Replace the key, if it has at least `shortest` characters."""
+        key = self.settings.key
+        if len(key) < shortest:
+            return text
+        return text.replace(key, "***")
 
 
 def make_api(
@@ -331,15 +315,10 @@ def make_client(settings: Settings) -> Any:
                 request=request,
             )
 
-    # The client's errors and logs name its address, so the login is sent in a header instead.
-    address = settings.address._replace(netloc=settings.address.netloc.rpartition("@")[2])
-    headers = {"Accept-Encoding": "identity"}
-    if settings.login:
-        headers["Authorization"] = f"Basic {_base64(settings.login.encode())}"
     return openai.OpenAI(
         api_key=settings.key or "none",
-        base_url=address.geturl() or None,
-        default_headers=headers,
+        base_url=settings.base_url,
+        default_headers={"Accept-Encoding": "identity"},
         timeout=settings.timeout,
         max_retries=settings.retries,
         # A redirect would send the question, images included, to another host.
@@ -425,9 +404,5 @@ def _token_count(usage: Any, name: str) -> int:
 
 def _image_part(pixels: np.ndarray) -> dict[str, Any]:
     """pixels: [H, W, 3] uint8."""
-    url = f"data:image/png;base64,{_base64(png_bytes(pixels))}"
-    return {"type": "image_url", "image_url": {"url": url}}
-
-
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode("ascii")
+    data = base64.b64encode(png_bytes(pixels)).decode("ascii")
+    return {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{data}"}}
