@@ -26,6 +26,9 @@ from mme_vla.evaluation.results.statistics import (
     holm,
     mean_interval,
     paired_interval,
+    paired_test,
+    percentiles,
+    sampled_test,
     sign_test,
     tango,
     wilson,
@@ -167,7 +170,36 @@ def test_the_ends_of_tangos_interval_have_the_score_of_its_level() -> None:
         assert abs(score) == pytest.approx(1.95996, abs=1e-3)
 
 
-def test_intervals_of_a_difference_never_contradict_the_sign_test() -> None:
+def test_a_task_of_few_episodes_makes_a_difference_uncertain() -> None:
+    low, high = paired_interval({"a": np.zeros(1), "b": np.zeros(99)})
+    assert low < -0.45 and high > 0.45
+    rng, covered = np.random.default_rng(0), 0
+    for _ in range(300):
+        gaps = {}
+        for name, count, gained in (("a", 2, 0.3), ("b", 50, 0.05)):
+            sampled = rng.random(count)
+            gaps[name] = (sampled < gained).astype(float) - (sampled > 0.95)
+        low, high = paired_interval(gaps)
+        covered += low <= (0.3 - 0.05 + 0.05 - 0.05) / 2 <= high
+    assert covered / 300 >= 0.92
+
+
+def test_a_test_of_a_difference_is_mcnemars_or_follows_the_mean() -> None:
+    gaps = np.array([1.0] * 12 + [-1.0] * 2 + [0.0] * 30)
+    assert paired_test({"a": gaps}) == sign_test(12, 2)
+    # More episodes favour the first side, and the mean over tasks the second.
+    assert paired_test({"a": -np.ones(2), "b": np.array([1.0] * 18 + [0.0] * 2)}) == 1.0
+    assert paired_test({"a": np.zeros(5)}) == 1.0
+
+
+def test_a_resampled_difference_is_significant_where_its_interval_has_no_zero() -> None:
+    values = np.random.default_rng(0).normal(size=2000)
+    for shift in (0.0, 1.0, 1.9, 2.1, 4.0):
+        low, high = percentiles(values + shift)
+        assert (sampled_test(values + shift) < 0.05) == (not low <= 0 <= high)
+
+
+def test_intervals_of_a_difference_never_contradict_the_test() -> None:
     for n in (1, 3, 5, 6, 12, 40):
         for won in range(0, n + 1, 1 + n // 8):
             for lost in range(0, n - won + 1, 1 + n // 8):
@@ -175,7 +207,8 @@ def test_intervals_of_a_difference_never_contradict_the_sign_test() -> None:
                 low, high = paired_interval({"a": gaps})
                 assert -1 <= low < high <= 1, "of no width"
                 assert low <= gaps.mean() <= high
-                assert (low <= 0 <= high) == (sign_test(won, lost) >= 0.05), (won, lost, n)
+                assert (low <= 0 <= high) == (paired_test({"a": gaps}) >= 0.05), (won, lost, n)
+                assert paired_test({"a": gaps}) >= sign_test(won, lost)
 
 
 @pytest.mark.slow

@@ -44,6 +44,15 @@ def records(
     ]
 
 
+def test_trainings_that_differ_more_than_the_methods_decide_nothing() -> None:
+    every = [*records(10), *records(0, seed=1)]
+    every += [*records(0, model="other"), *records(0, seed=1, model="other")]
+    results = aggregate(every, PROTOCOL)
+    comparison = compare(*results.methods, PROTOCOL)
+    assert (comparison.wins, comparison.losses) == (10, 0)
+    assert comparison.interval.low <= 0 and comparison.p > 0.05 and not comparison.significant
+
+
 def test_two_trainings_are_one_method_with_a_deviation_over_trainings() -> None:
     every = [
         *records(8),

@@ -130,7 +130,7 @@ def test_a_transform_that_returns_too_few_numbers_is_reported() -> None:
         ) -> np.ndarray:
             return np.ones(2, np.int64)
 
-    with pytest.raises(UserError, match="one for each of 9 frames"):
+    with pytest.raises(UserError, match="for each of 9 frames"):
         map_frames([Short()], 9, 0)
 
 

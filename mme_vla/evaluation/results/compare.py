@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pandas as pd
 
 from mme_vla.errors import counted, require
@@ -12,10 +13,13 @@ from mme_vla.evaluation.results.aggregate import Method, by_task
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import (
     Interval,
-    bootstrap,
     holm,
     paired_interval,
-    sign_test,
+    paired_test,
+    percentiles,
+    resampled_means,
+    sampled_test,
+    wins_losses,
 )
 
 
@@ -29,7 +33,8 @@ class Comparison:
         paired bootstrap over episodes and trainings.
     wins, losses: episodes that the first, or the second, solved in a larger share of its runs; the
         rest are ties.
-    p: exact two-sided test on wins and losses (McNemar's where each has one run).
+    p: two-sided (`paired_test`; of single runs with equally many episodes a task McNemar's exact
+        one), with several trainings at least that of the bootstrap.
     corrected: by Holm, over all comparisons made together.
     significant: `corrected` is below 1 − confidence.
     smallest_p: the smallest that p can be with so many episodes.
@@ -84,10 +89,7 @@ class Comparison:
             ]
         text = " against ".join(sides)
         if self.significant:
-            first_is_better = self.difference > 0
-            if self.paired:
-                first_is_better = self.wins > self.losses
-            better = self.first if first_is_better else self.second
+            better = self.first if self.difference > 0 else self.second
             text += f": {better} is significantly better"
         elif not self.testable:
             text += ": too few episodes to tell"
@@ -165,17 +167,18 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     gaps = (first_rates.mean(axis=1) - second_rates.mean(axis=1)).round(9)
     first_rate = _score(first_rates)
     second_rate = _score(second_rates)
-    interval = paired_interval(by_task(gaps), protocol.confidence)
+    gaps_of_tasks = by_task(gaps)
+    interval = paired_interval(gaps_of_tasks, protocol.confidence)
+    p = paired_test(gaps_of_tasks)
     if len(first_rates.columns) > 1 or len(second_rates.columns) > 1:
         first_values = by_task(first_rates)
         second_values = by_task(-second_rates)
         sides = {task: [first_values[task], second_values[task]] for task in first_values}
-        sampled = bootstrap(sides, protocol.confidence, protocol.samples, protocol.seed)
-        interval = interval.widen(sampled)
-    wins = int((gaps > 0).sum())
-    losses = int((gaps < 0).sum())
-    p = sign_test(wins, losses)
-    smallest_p = sign_test(len(gaps), 0)
+        sampled = resampled_means(sides, protocol.samples, protocol.seed).sum(0)
+        interval = interval.widen(percentiles(sampled, protocol.confidence))
+        p = max(p, sampled_test(sampled))
+    wins, losses = wins_losses(gaps_of_tasks)
+    smallest_p = paired_test({task: np.ones(len(values)) for task, values in gaps_of_tasks.items()})
     what = f"{first.label} − {second.label}"
     return Comparison(
         first.label,

@@ -6,8 +6,10 @@ All of them hold for three episodes as well as for 800. Rates are shares (0 to 1
 - A mean over tasks, or over repeated runs: the same, for an effective number of episodes (the
   design effect of survey statistics: Korn and Graubard 1998).
 - A paired difference: the score interval of Tango (1998), at least as wide as the exact interval
-  of the sign test (Clopper and Pearson 1934).
-- A paired test: the exact sign test. Several of them: Holm (1979).
+  of the sign test (Clopper and Pearson 1934), for an effective number of pairs where tasks have
+  unequal numbers (Kish 1965).
+- A paired test: the exact sign test and the score test of that difference, the larger p of both.
+  Several of them: Holm (1979).
 - Several trainings: a percentile bootstrap (Efron and Tibshirani 1993) over episodes and trainings.
 """
 
@@ -106,29 +108,47 @@ def paired_interval(gaps: Mapping[str, np.ndarray], confidence: float = 0.95) ->
     """Interval of a mean over tasks of paired differences.
 
     The wider of two: Tango's score interval, and the share of unequal pairs times the exact
-    interval of how many of them favour the first side. The second has 0 in it exactly where
-    `sign_test` has p ≥ 1 − confidence: without 0 in the wider one the test is significant. Of no
-    unequal pair nothing is known but that they are rare, which is what the first one states.
+    interval of how many of them favour the first side. It has 0 in it exactly where `paired_test`
+    has p ≥ 1 − confidence. Of no unequal pair nothing is known but that they are rare, which is
+    what the first one states.
 
     gaps: of each task, first side minus second of every pair, −1 … 1. Pairs of several runs have
         fractions, and count as so many pairs of single runs as their smaller spread is worth.
     """
-    n_pairs = sum(len(values) for values in gaps.values())
-    # A pair of a task with fewer pairs weighs more: the figure is a mean over tasks.
-    scaled = [values * (n_pairs / len(values) / len(gaps)) for values in gaps.values()]
-    weighted = np.concatenate(scaled)
-    gained = weighted[weighted > 0].sum()
-    lost = -weighted[weighted < 0].sum()
+    gained, lost, n_pairs = effective_pairs(gaps)
+    score = tango(gained, lost, n_pairs, confidence)
+    wins, losses = wins_losses(gaps)
+    if not wins + losses:
+        return score
+    low, high = binomtest(wins, wins + losses).proportion_ci(confidence, "exact")
+    share = (gained + lost) / n_pairs
+    return score.widen(Interval(share * float(2 * low - 1), share * float(2 * high - 1)))
+
+
+def effective_pairs(gaps: Mapping[str, np.ndarray]) -> tuple[float, float, float]:
+    """The independent pairs of single runs that a mean over tasks is worth: those that only the
+    first side solved, those that only the second did, and all.
+
+    A pair of a task with fewer pairs weighs more. n weights w are worth (Σw)² / Σw² equal ones.
+    """
+    gained = lost = squared_weights = 0.0
+    for values in gaps.values():
+        weight = 1 / (len(values) * len(gaps))
+        gained += weight * float(values[values > 0].sum())
+        lost -= weight * float(values[values < 0].sum())
+        squared_weights += weight**2 * len(values)
+    n_pairs = 1 / squared_weights
     unequal = np.concatenate(list(gaps.values()))
     unequal = unequal[unequal != 0]
-    if not len(unequal):
-        return tango(0.0, 0.0, n_pairs, confidence)
-    worth = np.abs(unequal).sum() / (unequal**2).sum()
-    score = tango(gained * worth, lost * worth, n_pairs * worth, confidence)
-    test = binomtest(int((unequal > 0).sum()), len(unequal))
-    low, high = test.proportion_ci(confidence, "exact")
-    share = float(gained + lost) / n_pairs
-    return score.widen(Interval(share * float(2 * low - 1), share * float(2 * high - 1)))
+    if len(unequal):
+        n_pairs *= float(np.abs(unequal).sum() / (unequal**2).sum())
+    return gained * n_pairs, lost * n_pairs, n_pairs
+
+
+def wins_losses(gaps: Mapping[str, np.ndarray]) -> tuple[int, int]:
+    """How many pairs favour the first side, and the second."""
+    values = np.concatenate(list(gaps.values()))
+    return int((values > 0).sum()), int((values < 0).sum())
 
 
 def tango(gained: float, lost: float, pairs: float, confidence: float = 0.95) -> Interval:
@@ -166,6 +186,29 @@ def sign_test(first: int, second: int) -> float:
     if first + second == 0:
         return 1.0
     return float(binomtest(first, first + second).pvalue)
+
+
+def paired_test(gaps: Mapping[str, np.ndarray]) -> float:
+    """Two-sided p of a mean over tasks of paired differences: the larger of the sign test and the
+    score test of the mean; 1 where most pairs favour one side and the mean the other.
+
+    gaps: as `paired_interval` takes them.
+    """
+    wins, losses = wins_losses(gaps)
+    gained, lost, _ = effective_pairs(gaps)
+    if (wins - losses) * (gained - lost) <= 0:
+        return 1.0
+    score = abs(gained - lost) / math.sqrt(gained + lost)
+    return max(sign_test(wins, losses), float(2 * norm.sf(score)))
+
+
+def sampled_test(values: np.ndarray) -> float:
+    """Two-sided p of a difference from resampled values of it: below 1 − confidence where
+    `percentiles` has no 0 in it.
+    """
+    below = float((values <= 0).mean())
+    above = float((values >= 0).mean())
+    return min(1.0, 2 * min(below, above))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
