@@ -183,25 +183,36 @@ def over_trainings(success: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
 
     success: columns are numbers in `runs`.
     """
-    names: dict[int | None, int] = {}
-    groups = []
-    for number in success.columns:
-        seed = _training_seed(runs[number])
-        groups.append(names.setdefault(seed, len(names)))
-    return success.T.groupby(groups).mean().T
+    groups = training_numbers(runs)
+    return success.T.groupby([groups[number] for number in success.columns]).mean().T
 
 
-def _training_seed(run: Run) -> int | None:
-    return None if run.key.training is None else run.key.training.seed
+def training_numbers(runs: Sequence[Run]) -> list[int]:
+    """The number of each run's training; one number where records do not name their training.
 
-
-def by_training(runs: Iterable[Run]) -> list[list[Run]]:
-    """Runs by the seed of their training, in their order; one group where records do not name their
-    training.
+    Checkpoints of one training have weights each, so its seed tells it from others. Trainings of
+    one seed have different weights at the same checkpoint, and are told apart by their order there.
     """
-    groups: dict[int | None, list[Run]] = {}
+    weights: dict[tuple[int | None, int | str], list[str]] = {}
+    numbers: dict[tuple[int | None, int], int] = {}
+    result = []
     for run in runs:
-        groups.setdefault(_training_seed(run), []).append(run)
+        training = run.key.training or TrainingIdentity()
+        place = 0
+        if training.weights is not None:
+            of_checkpoint = weights.setdefault((training.seed, run.key.checkpoint), [])
+            if training.weights not in of_checkpoint:
+                of_checkpoint.append(training.weights)
+            place = of_checkpoint.index(training.weights)
+        result.append(numbers.setdefault((training.seed, place), len(numbers)))
+    return result
+
+
+def by_training(runs: Sequence[Run]) -> list[list[Run]]:
+    """Runs by their training, in their order."""
+    groups: dict[int, list[Run]] = {}
+    for number, run in zip(training_numbers(runs), runs, strict=True):
+        groups.setdefault(number, []).append(run)
     return list(groups.values())
 
 
@@ -388,7 +399,7 @@ def _method(key: RunKey, table: pd.DataFrame, protocol: Protocol) -> Method:
         runs.append(Run(run, records, protocol))
     runs.sort(
         key=lambda run: (
-            _training_seed(run) or 0,
+            (run.key.training or TrainingIdentity()).seed or 0,
             str(run.key.checkpoint).zfill(12),
             run.key.model_seed,
         )
