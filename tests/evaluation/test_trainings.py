@@ -68,12 +68,10 @@ def test_two_trainings_are_one_method_with_a_deviation_over_trainings() -> None:
     assert leaderboard(method, results)[0].columns[1] == "Training 0, Seed 7"
 
 
-def test_trainings_of_one_seed_are_told_apart_by_their_weights() -> None:
+def test_trainings_of_one_seed_differ_by_their_weights() -> None:
     def weighed(name: str | None, won: int, checkpoint: int = 100) -> list[EpisodeRecord]:
         trained = TrainingIdentity(0, "r", "d", name)
-        return [
-            replace(record, training=trained, checkpoint=checkpoint) for record in records(won)
-        ]
+        return [replace(record, training=trained, checkpoint=checkpoint) for record in records(won)]
 
     def trainings(*parts: list[EpisodeRecord]) -> list[list[tuple[int | str, str | None]]]:
         (method,) = aggregate([record for part in parts for record in part], PROTOCOL).methods
