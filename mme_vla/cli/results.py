@@ -15,9 +15,9 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.envs.episodes import ALL, GRAMMAR, check_episodes, choose_numbers, read_episodes
 from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
-from mme_vla.errors import UserError, printable, require
-from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
+from mme_vla.errors import UserError, counted, printable, require
+from mme_vla.evaluation.records import EpisodeRecord, merge
+from mme_vla.evaluation.results.aggregate import Method, Results, aggregate, limit_notes, select
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.compare import (
     Comparison,
@@ -158,7 +158,8 @@ def run(args: argparse.Namespace) -> None:
     if args.title is None:
         is_benchmark = any(task in TASK_FACTS for task in protocol.tasks)
         args.title = "RoboMME results" if is_benchmark else "Results"
-    _check_views(args)
+    if _check_views(args):
+        records, _ = select(records, protocol, args.split)
     if args.stress:
         curves = stress_curves(records, args.confidence, args.conflicts)
         show_tables(
@@ -229,15 +230,21 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
     )
 
 
-def _check_views(args: argparse.Namespace) -> None:
-    """Refuse two views at once, and options that a view would leave unused."""
+def _check_views(args: argparse.Namespace) -> bool:
+    """Whether a view is asked for; refuses two at once, and options that it would leave unused."""
     views = [f"--{name}" for name in ("stress", "events", "ood") if getattr(args, name)]
     require(len(views) < 2, f"{' and '.join(views)}: name one of them.")
-    unused = [f"--{name}" for name in ("csv", "latex", "compare") if getattr(args, name)]
+    names = ["csv", "latex", "compare", "all", "brief", "samples", "seed"]
+    if args.stress:
+        names.append("split")  # its curves are over splits
+    default = _parser().get_default
+    unused = [f"--{name}" for name in names if getattr(args, name) != default(name)]
     require(
         not views or not unused,
-        f"{' and '.join(unused)}: not with {''.join(views)}, which writes --markdown and --html.",
+        f"{' and '.join(unused)}: not with {''.join(views)}, which takes --tasks, --episodes,"
+        " --errors, --markdown and --html.",
     )
+    return bool(views)
 
 
 def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
@@ -314,6 +321,10 @@ def show_tables(
             print_table(table, Console().width)
             blocks.append(to_markdown(table))
             sections.append(Section(table.title, tables=[table]))
+    notes += limit_notes(records)
+    errors = sum(record.outcome == "error" for record in merge(records, args.conflicts))
+    if errors:
+        notes.append(f"{counted(errors, 'episode')} ended in an error, which counts as a failure.")
     notes += missing_baselines(record.model for record in records)
     for note in notes:
         print(f"• {printable(note)}")

@@ -419,6 +419,81 @@ def test_results_pair_events_with_their_matched_arms(
         event_table(records("test", [1]))
 
 
+def failing(record: EpisodeRecord) -> EpisodeRecord:
+    never: Any = ({"event": "pause:50", "step": None},)
+    return replace(record, outcome="error", error="x", events=never)
+
+
+def test_errors_are_failures_in_table_and_curve_unless_they_are_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, *others = under("pause:50", [1, 1, 0, 0])
+    made = [*under(None, [1, 1, 1, 0]), failing(first), *others]
+    (row,) = event_table(made).rows
+    assert row[4:] == ["4", "75.0", "25.0", "1", "2", "0", "0.500", "0"]
+    (points,) = event_curves(made).values()
+    assert [(p.won, p.episodes) for p in points.values()] == [(3, 4), (1, 4)]
+
+    save_records(tmp_path, made)
+    page = tmp_path / "page.md"
+    results([str(tmp_path), "--events", "--markdown", str(page)])
+    assert "| 4 | 75.0 | 25.0 |" in page.read_text()
+    assert "1 episode ended in an error, which counts as a failure." in capsys.readouterr().out
+    results([str(tmp_path), "--events", "--errors", "missing", "--markdown", str(page)])
+    text = page.read_text()
+    assert "| 3 | 66.7 | 33.3 |" in text and "| pause | 50 | 3 | 33.3 |" in text
+    assert "error" not in capsys.readouterr().out
+
+
+def test_a_rate_of_several_tasks_under_an_event_is_their_mean() -> None:
+    made = []
+    for event, won in ((None, [1, 1, 1, 1]), ("pause:50", [0, 0, 0, 1])):
+        of_task = under(event, won)
+        made += [replace(record, task="StopCube") for record in of_task[:3]] + of_task[3:]
+    row = event_table(made).rows[-1]
+    assert (row[2], row[5], row[6]) == ("all", "100.0", "50.0")
+
+
+def test_a_view_takes_the_tasks_episodes_and_split_that_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = []
+    for event, won in ((None, [1, 1, 1, 1]), ("pause:50", [1, 0, 0, 0])):
+        of_event = under(event, won)
+        made += [*of_event, *(replace(record, task="StopCube") for record in of_event)]
+        made += [replace(record, split="val", seed=9) for record in of_event]
+    save_records(tmp_path, made)
+    page = tmp_path / "page.md"
+
+    def rows(*words: str) -> list[list[str]]:
+        results([str(tmp_path), "--events", "--markdown", str(page), *words])
+        table = page.read_text().partition("### Success")[0]
+        cells = [line.split(" | ") for line in table.splitlines() if "pause:50" in line]
+        return [[row[0].rpartition(", ")[2], *row[2:7]] for row in cells]
+
+    assert rows("--split", "val") == [["val", "PickXtimes", "1", "4", "100.0", "25.0"]]
+    words = "--split", "test", "--tasks", "StopCube", "--episodes", "0-1"
+    assert rows(*words) == [["test", "StopCube", "1", "2", "100.0", "50.0"]]
+    capsys.readouterr()
+    for wrong, message in (
+        ("--events --tasks StopCub", "no task 'StopCub'"),
+        ("--events --all --samples 9", "--all and --samples: not with --events"),
+        ("--stress --split val", "--split: not with --stress"),
+    ):
+        with pytest.raises(SystemExit):
+            results([str(tmp_path), *wrong.split()])
+        assert message in capsys.readouterr().err
+
+
+def test_a_matched_arm_of_another_step_limit_is_noted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shorter = [replace(record, max_steps=50) for record in under("pause:50", [0, 0])]
+    save_records(tmp_path, [*under(None, [1, 1]), *shorter])
+    results([str(tmp_path), "--events"])
+    assert "Step limits differ: 1300 in m, " in capsys.readouterr().out
+
+
 def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     won = {None: ([1, 1, 1, 1], [1, 1, 0, 0]), "pause:64": ([0, 0, 0, 1], [1, 0, 1, 0])}
     made = [

@@ -55,6 +55,39 @@ def test_success_is_counted_by_tier_beside_the_published_figures() -> None:
     assert [row[:3] for row in tier.rows] == [["StopCube", "–", "1/2"], ["all", "–", "1/2"]]
 
 
+def test_rates_are_means_over_tasks_beside_published_figures_of_the_same() -> None:
+    records = made("PickXtimes", "ood", [1] * 50) + made("StopCube", "ood", [0] * 10)
+    (table,) = ood.tier_tables(records)
+    row = dict(zip(table.columns, table.rows[-1], strict=True))
+    assert (row["task"], row["all"], row["%"]) == ("all", "50/60", "50.0")
+    assert row["GroundSG+Oracle"] == "58.0", "of these two tasks"
+    assert table.notes[0].endswith("has 60 of the 100 episodes that published figures are of.")
+
+    hard = ood.hard_table(made("PickXtimes", "hard", [1] * 4) + made("StopCube", "hard", [0]))
+    assert hard is not None and hard.rows[0][1:3] == ["4/5", "50.0"]
+    assert hard.notes[0].endswith("has 5 of the 192 episodes that published figures are of.")
+
+    records = made("StopCube", "test", [0] * 10) + made("StopCube", "twin", [0] * 10)
+    records += made("PickXtimes", "test", [0]) + made("PickXtimes", "twin", [1])
+    twins = ood.twin_table(records)
+    assert twins is not None
+    row = dict(zip(twins.columns, twins.rows[0], strict=True))
+    assert (row["episodes"], row["lost by memory"], row["lost by control"]) == (
+        "11",
+        "+50.0",
+        "50.0",
+    )
+    (interval,) = [
+        method.average.interval
+        for method in aggregate(
+            [record for record in records if record.split == "twin"],
+            Protocol.of_records(records),
+        ).methods
+    ]
+    assert interval is not None
+    assert row["twin (%)"] == f"50.0 [{interval.low:.1f}, {interval.high:.1f}]"
+
+
 def test_published_totals_are_the_sums_of_their_tasks() -> None:
     for row in ood.paper_table("ood"):
         assert sum(int(row[task]) for task in ood.PAPER_ORDER) == int(row["all"])
@@ -91,13 +124,26 @@ def test_success_is_set_against_the_amount_over_all_splits() -> None:
     assert "<svg" in next(iter(ood.extrapolation_figures(curves).values()))
 
 
+def test_a_scene_of_two_splits_counts_once() -> None:
+    full = made("StopCube", "test", [1] * 8) + made("StopCube", "ood", [1] * 50)
+    parts = made("StopCube", "hard", [0, 0]) + made("StopCube", "ood:xhard2", [0] * 4)
+    alone = ood.extrapolation(full)
+    assert ood.extrapolation(full + parts) == alone
+    (points,) = ood.extrapolation(parts).values()
+    assert sum(share.episodes for share in points.values()) == 6
+    more = ood.extrapolation(full + made("StopCube", "hard", [0, 0, 0]))
+    counts = [sum(p.episodes for p in points.values()) for points in (*alone.values(),)]
+    assert counts == [58] and sum(p.episodes for p in next(iter(more.values())).values()) == 59
+
+
 def test_the_papers_figures_do_not_stand_beside_other_episodes() -> None:
     for split in ("ood", "hard", "challenge", "twin:ood"):
         results = aggregate(
             made("StopCube", split, [1] * 12, model="framesamp_modul"), Protocol(("StopCube",), 12)
         )
         assert results.methods[0].paper is None
-        assert any("none of the benchmark's" in note for note in results.notes)
+        (note,) = [note for note in results.notes if "none of the benchmark's" in note]
+        assert ("beyond the benchmark's own" in note) == (split != "hard")
 
 
 def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -457,6 +457,30 @@ def test_the_best_of_several_methods_is_named_with_those_that_solve_as_many(
     assert conclude(results, []) == [sentence]
 
 
+def test_methods_without_all_episodes_are_not_ranked() -> None:
+    every = records("a", {"StopCube": [1] * 6})
+    assert conclude(aggregate([*every[:3], *records("b", {"StopCube": [0] * 6})[3:]]), []) == [
+        "None of 2 methods has all its episodes yet, so none is ranked."
+    ]
+    made = [*every[:3]]
+    for name, n_solved in (("b", 2), ("c", 1)):
+        made += records(name, {"StopCube": [number < n_solved for number in range(6)]})
+    (sentence,) = conclude(aggregate(made, Protocol.of_records(made)), [])
+    assert sentence.startswith("b solves 33.3 % of 6 episodes")
+    assert sentence.endswith("the most of 2 complete methods; next is c with 16.7 %.")
+
+
+def test_step_limits_that_differ_are_noted() -> None:
+    first = records("a", {"StopCube": [1, 0], "BinFill": [1, 0]})
+    second = records("b", {"StopCube": [1, 0], "BinFill": [1, 0]})
+    shorter = [replace(record, max_steps=20) for record in second]
+    notes = aggregate([*first, *shorter], Protocol.of_records(first)).notes
+    (note,) = [note for note in notes if "Step limits" in note]
+    assert note.startswith("Step limits differ: 1300 in a, ") and "; 20 in b, " in note
+    equal = aggregate([*first, *second], Protocol.of_records(first)).notes
+    assert not any("Step limits" in note for note in equal)
+
+
 def test_every_figure_of_tasks_with_unequal_numbers_of_episodes_is_a_mean_over_tasks() -> None:
     made = records("mine", {"StopCube": [1], "BinFill": [0] * 9})
     results = aggregate(made, Protocol.of_records(made))

@@ -77,6 +77,30 @@ def test_two_trainings_are_one_method_with_a_deviation_over_trainings() -> None:
     assert leaderboard(method, results)[0].columns[1] == "Training 0, Seed 7"
 
 
+def test_trainings_of_one_seed_differ_by_their_weights() -> None:
+    def weighed(name: str | None, won: int, checkpoint: int = 100) -> list[EpisodeRecord]:
+        trained = TrainingIdentity(0, "r", "d", name)
+        return [replace(record, training=trained, checkpoint=checkpoint) for record in records(won)]
+
+    def trainings(*parts: list[EpisodeRecord]) -> list[list[tuple[int | str, str | None]]]:
+        (method,) = aggregate([record for part in parts for record in part], PROTOCOL).methods
+        names = []
+        for runs in method.trainings:
+            named = [run.key.training or TrainingIdentity() for run in runs]
+            keys = [run.key.checkpoint for run in runs]
+            names.append([(key, one.weights) for key, one in zip(keys, named, strict=True)])
+        return names
+
+    two = weighed("a", 8), weighed("b", 2)
+    assert trainings(*two) == [[(100, "a")], [(100, "b")]]
+    average = aggregate([*two[0], *two[1]], PROTOCOL).methods[0].average
+    assert average.interval and average.interval.low <= 20 and average.interval.high >= 80
+    later = weighed("c", 8, 200), weighed("d", 2, 200)
+    assert trainings(two[0], later[0]) == [[(100, "a"), (200, "c")]], "one training's checkpoints"
+    assert trainings(*two, *later) == [[(100, "a"), (200, "c")], [(100, "b"), (200, "d")]]
+    assert trainings(weighed(None, 8), two[0]) == [[(100, None), (100, "a")]]
+
+
 def test_two_recipes_are_not_averaged() -> None:
     results = aggregate([*records(8, recipe="400"), *records(2, recipe="1200")], PROTOCOL)
     assert sorted(method.label for method in results.methods) == ["m#1200", "m#400"]

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from mme_vla.config.naming import DEFAULT_BUDGET
-from mme_vla.envs.metadata import is_other
+from mme_vla.envs.metadata import BASE, HARD, base_of, is_other
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, counted, did_you_mean, require
 from mme_vla.evaluation.pairing import pair
@@ -183,25 +183,36 @@ def over_trainings(success: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
 
     success: columns are numbers in `runs`.
     """
-    names: dict[int | None, int] = {}
-    groups = []
-    for number in success.columns:
-        seed = _training_seed(runs[number])
-        groups.append(names.setdefault(seed, len(names)))
-    return success.T.groupby(groups).mean().T
+    groups = training_numbers(runs)
+    return success.T.groupby([groups[number] for number in success.columns]).mean().T
 
 
-def _training_seed(run: Run) -> int | None:
-    return None if run.key.training is None else run.key.training.seed
+def training_numbers(runs: Sequence[Run]) -> list[int]:
+    """The number of each run's training; one number where records do not name their training.
 
-
-def by_training(runs: Iterable[Run]) -> list[list[Run]]:
-    """Runs by the seed of their training, in their order; one group where records do not name their
-    training.
+    Checkpoints of one training have weights each, so its seed tells it from others. Trainings of
+    one seed have different weights at the same checkpoint, and are told apart by their order there.
     """
-    groups: dict[int | None, list[Run]] = {}
+    weights: dict[tuple[int | None, int | str], list[str]] = {}
+    numbers: dict[tuple[int | None, int], int] = {}
+    result = []
     for run in runs:
-        groups.setdefault(_training_seed(run), []).append(run)
+        training = run.key.training or TrainingIdentity()
+        place = 0
+        if training.weights is not None:
+            of_checkpoint = weights.setdefault((training.seed, run.key.checkpoint), [])
+            if training.weights not in of_checkpoint:
+                of_checkpoint.append(training.weights)
+            place = of_checkpoint.index(training.weights)
+        result.append(numbers.setdefault((training.seed, place), len(numbers)))
+    return result
+
+
+def by_training(runs: Sequence[Run]) -> list[list[Run]]:
+    """Runs by their training, in their order."""
+    groups: dict[int, list[Run]] = {}
+    for number, run in zip(training_numbers(runs), runs, strict=True):
+        groups.setdefault(number, []).append(run)
     return list(groups.values())
 
 
@@ -246,19 +257,47 @@ def aggregate(
     protocol = replace(protocol, task_suites={**suites_of(records), **protocol.task_suites})
     protocol = replace(protocol, groupings={**groupings_of(records), **protocol.groupings})
     merged = merge(records, conflicts)
-    known = {*PAPER_ORDER, *(record.task for record in merged)}
+    splits = sorted({record.split for record in merged})
+    require(
+        split is not None or len(splits) < 2,
+        f"These are results of several splits ({', '.join(splits)}): choose one with --split.",
+    )
+    included, n_outside = select(merged, protocol, split)
+    _check_environments(included)
+    check_settings(included)
+    table = record_table(included)
+    keys = {run: _method_key(run) for run in set(table["run"])}
+    table["method"] = [keys[run] for run in table["run"]]
+    by_method = table.groupby("method", sort=False)
+    methods = [_method(key, members, protocol) for key, members in by_method]
+    methods.sort(key=lambda method: is_standing(method.key.model))  # last in every table
+    repeats = repeated_episodes(records)
+    for method in methods:
+        for run in method.runs:
+            repeated, flipped = repeats.get(run.key, (0, 0))
+            method.repeated += repeated
+            method.flipped += flipped
+    notes = _tell_apart(methods)
+    notes += _notes(methods, protocol, n_outside)
+    return Results(methods, protocol, notes)
+
+
+def select(
+    records: Sequence[EpisodeRecord], protocol: Protocol, split: str | None = None
+) -> tuple[list[EpisodeRecord], int]:
+    """The records that count, and how many of the split are of other tasks or episodes.
+
+    split: these alone; None for all.
+    """
+    known = {*PAPER_ORDER, *(record.task for record in records)}
     for task in protocol.tasks:
         if task not in known:
             raise UserError(
                 f"RoboMME has no task {task!r}, and no record is of it. {did_you_mean(task, known)}"
             )
-    splits = sorted({record.split for record in merged})
-    if split is None and len(splits) > 1:
-        raise UserError(
-            f"These are results of several splits ({', '.join(splits)}): choose one with --split."
-        )
-    selected = [r for r in merged if split in (None, r.split)]
+    selected = [r for r in records if split in (None, r.split)]
     if not selected:
+        splits = sorted({record.split for record in records})
         of_split = f" of split {split!r}" if split else ""
         raise UserError(f"There is no record{of_split}; there are: {splits or 'none'}.")
     inside = [r for r in selected if protocol.expects(r.key)]
@@ -283,23 +322,7 @@ def aggregate(
         f"None of the {len(selected)} records is of the tasks and episodes asked for; they are of"
         f" {'; '.join(listed)}.",
     )
-    _check_environments(included)
-    check_settings(included)
-    table = record_table(included)
-    keys = {run: _method_key(run) for run in set(table["run"])}
-    table["method"] = [keys[run] for run in table["run"]]
-    by_method = table.groupby("method", sort=False)
-    methods = [_method(key, members, protocol) for key, members in by_method]
-    methods.sort(key=lambda method: is_standing(method.key.model))  # last in every table
-    repeats = repeated_episodes(records)
-    for method in methods:
-        for run in method.runs:
-            repeated, flipped = repeats.get(run.key, (0, 0))
-            method.repeated += repeated
-            method.flipped += flipped
-    notes = _tell_apart(methods)
-    notes += _notes(methods, protocol, len(selected) - len(inside))
-    return Results(methods, protocol, notes)
+    return included, len(selected) - len(inside)
 
 
 def _method_key(run: RunKey) -> RunKey:
@@ -388,7 +411,7 @@ def _method(key: RunKey, table: pd.DataFrame, protocol: Protocol) -> Method:
         runs.append(Run(run, records, protocol))
     runs.sort(
         key=lambda run: (
-            _training_seed(run) or 0,
+            (run.key.training or TrainingIdentity()).seed or 0,
             str(run.key.checkpoint).zfill(12),
             run.key.model_seed,
         )
@@ -485,6 +508,23 @@ def _check_environments(records: Sequence[EpisodeRecord]) -> None:
         )
 
 
+def limit_notes(records: Iterable[EpisodeRecord]) -> list[str]:
+    """A sentence where a task was run with several step limits, variants of a split included."""
+    limits: dict[tuple[str, str], dict[int, RunKey]] = {}
+    for record in records:
+        of_task = limits.setdefault((base_of(record.split), record.task), {})
+        of_task.setdefault(record.max_steps, record.run)
+    notes: list[str] = []
+    for of_task in limits.values():
+        if len(of_task) > 1:
+            listed = "; ".join(f"{limit} in {run}" for limit, run in of_task.items())
+            notes.append(
+                f"Step limits differ: {listed}. Episodes that need more steps fail under the"
+                " smaller one."
+            )
+    return list(dict.fromkeys(notes))  # tasks of the same limits share one
+
+
 def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[str]:
     notes = []
     for method in methods:
@@ -521,15 +561,16 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
                     f" {counted(same.left_out, 'episode')}: the scenes differ or only some runs"
                     " name them; its mean is over all of them."
                 )
+    notes += limit_notes(record for method in methods for record in method.table["record"])
     splits: set[str] = set()
     for method in methods:
         splits.update(run.key.split for run in method.runs)
     for split in sorted(splits):
         if is_other(split):
-            notes.append(
-                f"Split {split!r}: scenes beyond the benchmark's own; figures of it are none of the"
-                " benchmark's."
-            )
+            what = "scenes beyond the benchmark's own"
+            if split == HARD:
+                what = f"the {BASE} split's hard episodes alone"
+            notes.append(f"Split {split!r}: {what}; figures of it are none of the benchmark's.")
     if outside:
         notes.append(
             f"Left out: {counted(outside, 'record')} of other tasks, or of other episodes."

@@ -18,7 +18,7 @@ from mme_vla.errors import require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Results, record_table
-from mme_vla.evaluation.results.statistics import Interval, wilson
+from mme_vla.evaluation.results.statistics import Interval, effective_trials, wilson
 from mme_vla.evaluation.results.tables import Table, span, task_tables
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils.style import COLOURS, LINE, figure, svg
@@ -26,16 +26,14 @@ from mme_vla.utils.style import COLOURS, LINE, figure, svg
 
 @dataclass(frozen=True)
 class Share:
-    """Successes among episodes. interval: Wilson's, over distinct episodes; in percent."""
+    """Successes among episodes. rate: a mean over tasks; interval: of it, over distinct episodes;
+    both in percent.
+    """
 
     won: int
     episodes: int
+    rate: float
     interval: Interval
-
-    @property
-    def rate(self) -> float:
-        """In percent."""
-        return 100 * self.won / self.episodes
 
     def __str__(self) -> str:
         return f"{self.won}/{self.episodes}"
@@ -43,10 +41,14 @@ class Share:
 
 def count_successes(table: pd.DataFrame, confidence: float) -> Share:
     """Count the successes of a part of `record_table` that has one row at least."""
-    won = int(table["success"].sum())
-    distinct = len({(r.split, r.key) for r in table["record"]})
-    interval = wilson(won / len(table), distinct, confidence)
-    return Share(won, len(table), interval.percent)
+    success = table["success"]
+    rate = float(success.groupby(table["task"]).mean().mean())
+    splits = np.array([record.split for record in table["record"]])
+    # Trainings share the scene of an episode.
+    distinct = success.groupby([table["task"], splits, table["episode"]]).mean()
+    tasks = [part.to_numpy()[:, None] for _, part in distinct.groupby(level="task")]
+    interval = wilson(rate, effective_trials(tasks), confidence)
+    return Share(int(success.sum()), len(table), 100 * rate, interval.percent)
 
 
 Curves = dict[tuple[str, str, str], dict[float, Share]]

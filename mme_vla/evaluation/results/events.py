@@ -39,8 +39,10 @@ def matched_methods(results: Results) -> list[tuple[Method, Method]]:
 
 def did_not_act(record: EpisodeRecord) -> list[str]:
     """The events of a record whose place never came: a sub-task that did not begin, a step beyond
-    the end.
+    the end. None of an episode that ended in an error, perhaps before.
     """
+    if record.outcome == "error":
+        return []
     return [entry["event"] for entry in record.events if entry["step"] is None]
 
 
@@ -48,8 +50,7 @@ def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
     """A line for each event that did not act in some episodes."""
     counts: Counter[str] = Counter()
     for record in records:
-        if record.outcome != "error":
-            counts.update(did_not_act(record))
+        counts.update(did_not_act(record))
     lines = []
     for event, count in counts.items():
         episodes = counted(count, "episode")
@@ -60,16 +61,15 @@ def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
 def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> Table:
     """Of every recipe, event and task: both success rates, and which outcomes the event changed.
 
-    A rate is the mean over trainings, ± its sample standard deviation. Pairs are those of all
-    trainings; an episode that ended in an error has none. p is a sign test over scenes: one is
-    lost, or gained, where more trainings lose it than gain it, or fewer.
+    A rate is the mean over tasks, then over trainings, ± its sample standard deviation. Pairs are
+    those of all trainings; an episode that ended in an error is a failure. p is a sign test over
+    scenes: one is lost, or gained, where more trainings lose it than gain it, or fewer.
     """
     merged = merge(records, conflicts)
     require(any(record.event for record in merged), NO_EVENTS)
     runs: dict[RunKey, dict[EpisodeKey, list[EpisodeRecord]]] = {}
     for record in merged:
-        if record.outcome != "error":
-            runs.setdefault(record.run, {})[record.key] = [record]
+        runs.setdefault(record.run, {})[record.key] = [record]
 
     # The pairs of every recipe, and notes on episodes that were not paired for their scenes.
     groups: dict[RunKey, list[Pair]] = {}
@@ -107,19 +107,21 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
 def _counts(pairs: Sequence[Pair]) -> list[str]:
     """The cells of one row from "trainings" on."""
     changes: Counter[tuple[bool, bool]] = Counter()  # success without, and with the event
-    trainings: dict[TrainingIdentity | None, list[tuple[bool, bool]]] = {}
+    trainings: dict[TrainingIdentity | None, dict[str, list[tuple[bool, bool]]]] = {}
     scenes: Counter[EpisodeKey] = Counter()  # trainings that lost it, less those that gained it
     n_idle = 0
     for record, baseline in pairs:
         change = (baseline.success, record.success)
         changes[change] += 1
-        trainings.setdefault(record.training, []).append(change)
+        trainings.setdefault(record.training, {}).setdefault(record.task, []).append(change)
         scenes[record.key] += baseline.success - record.success
         n_idle += bool(did_not_act(record))
 
     cells = [str(len(trainings)), str(len(pairs))]
-    rates = 100 * np.array([np.mean(part, axis=0) for part in trainings.values()])
-    for side in rates.T:  # without, and with the event
+    rates = []  # of each training without, and with the event
+    for tasks in trainings.values():
+        rates.append(np.mean([np.mean(part, axis=0) for part in tasks.values()], axis=0))
+    for side in 100 * np.array(rates).T:
         cell = f"{side.mean():.1f}"
         if len(side) > 1:
             cell += f" ± {side.std(ddof=1):.1f}"

@@ -19,7 +19,7 @@ from mme_vla.envs.rows import OOD, TIERS
 from mme_vla.envs.scene_hash import scene_digest
 from mme_vla.errors import SceneError
 from mme_vla.evaluation.pairing import pair
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, merge
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import record_table, repeated_episodes
 from mme_vla.evaluation.results.curves import Curves, count_successes, run_names, stress_figures
 from mme_vla.evaluation.results.paper import paper_table
@@ -27,6 +27,8 @@ from mme_vla.evaluation.results.scopes import PAPER_ORDER
 from mme_vla.evaluation.results.tables import Table, span
 
 SOURCE = "development records of the authors, one run each, 1,600 steps"
+FULL_SPLIT = {HARD: BASE, **{f"{OOD}:{tier}": OOD for tier in TIERS}}
+"""Split → the split whose scenes it has some of, with their seeds."""
 AMOUNTS: dict[str, tuple[str, str, tuple[int, int]]] = {
     "PickXtimes": ("count", "objects.num_repeats", (1, 5)),
     "SwingXtimes": ("count", "objects.num_repeats", (1, 3)),
@@ -57,7 +59,9 @@ def base_of(split: str) -> str:
 def tier_tables(
     records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
 ) -> list[Table]:
-    """For each run on RoboMME-OOD: success by task and tier, beside the published figures."""
+    """For each run on RoboMME-OOD: success by task and tier, beside the published figures of the
+    same tasks. Rates are means over tasks, here and below.
+    """
     of_tiers = []
     for record in merge(records, conflicts):
         if base_of(record.split) == OOD and read_variant(record.split) is None:
@@ -72,6 +76,7 @@ def tier_tables(
             part = members[members["task"] == task]
             if not part.empty:
                 parts[task] = part
+        tasks = list(parts)
         parts["all"] = members
         rows = []
         for task, part in parts.items():
@@ -81,16 +86,24 @@ def tier_tables(
                 row.append("–" if cell.empty else str(count_successes(cell, confidence)))
             share = count_successes(part, confidence)
             row += [str(share), f"{share.rate:.1f}", span(share.interval)]
+            names = tasks if task == "all" else [task]
             for line in published:
-                n_episodes = int(line["episodes"])
-                if task == "all":
-                    n_episodes *= len(PAPER_ORDER)
-                row.append(f"{100 * int(line[task]) / n_episodes:.1f}")
+                solved = sum(int(line[name]) for name in names)
+                row.append(f"{100 * solved / len(names) / int(line['episodes']):.1f}")
             rows.append(row)
         last = len(rows) - 1
         title = f"{run} on RoboMME-OOD; published: {SOURCE}"
-        tables.append(Table(title, columns, rows, {last}, {last}))
+        n_published = sum(len(metadata.episodes(task, OOD)) for task in tasks)
+        notes = _partial(run, len(members), n_published)
+        tables.append(Table(title, columns, rows, {last}, {last}, notes=notes))
     return tables
+
+
+def _partial(run: RunKey, done: int, published: int) -> list[str]:
+    """A note where a run has only some of the episodes that published figures are of."""
+    if done == published:
+        return []
+    return [f"{run} has {done:,} of the {published:,} episodes that published figures are of."]
 
 
 def hard_table(
@@ -102,12 +115,15 @@ def hard_table(
     merged = [r for r in merge(records, conflicts) if r.split == HARD]
     if not merged:
         return None
+    published = paper_table("hard")
     rows = []
+    notes: list[str] = []
     for run, members in record_table(merged).groupby("run", sort=False):
         share = count_successes(members, confidence)
         rows.append([str(run), str(share), f"{share.rate:.1f}", span(share.interval)])
+        notes += _partial(run, len(members), int(published[0]["episodes"]))
     n_runs = len(rows)
-    for row in paper_table("hard"):
+    for row in published:
         won = [int(n) for n in row["won"].split()]
         rate = 100 * sum(won) / len(won) / int(row["episodes"])
         rows.append(
@@ -119,7 +135,8 @@ def hard_table(
             ]
         )
     columns = ["run", "successes", "%", f"{100 * confidence:g} %"]
-    return Table(f"Hard test episodes; published: {SOURCE}", columns, rows, {n_runs})
+    title = f"Hard test episodes; published: {SOURCE}"
+    return Table(title, columns, rows, {n_runs}, notes=notes)
 
 
 def twin_table(
@@ -229,10 +246,12 @@ def extrapolation(
     """Success against the amount of what grows, over all splits of a model: training, test, stress
     and OOD. The dial of a curve is what grows.
 
-    Twins, and scenes that cannot be built or are other ones here, are left out.
+    Twins, and scenes that cannot be built or are other ones here, are left out. A scene of two
+    splits, the test split and its hard episodes or `ood` and a tier, counts once, as it first came.
     """
     counted = []
     amounts = []
+    scenes = set()
     for record in merge(records, conflicts):
         variant = read_variant(record.split)
         if variant is not None and variant.twin:
@@ -240,7 +259,11 @@ def extrapolation(
         if record.task not in AMOUNTS:
             continue
         amount = amount_of(record.task, record.split, record.key, record.named_scene)
-        if amount is not None:
+        split = FULL_SPLIT.get(record.split, record.split)
+        number = record.seed if split in FULL_SPLIT.values() else record.episode
+        scene = record.run._replace(split=split), record.task, number
+        if amount is not None and scene not in scenes:
+            scenes.add(scene)
             counted.append(record)
             amounts.append(amount)
     table = record_table(counted)

@@ -177,7 +177,13 @@ def conclude(results: Results, comparisons: Sequence[Comparison]) -> list[str]:
     if comparisons:
         return [f"{comparison.verdict}." for comparison in comparisons]
     protocol = results.protocol
-    ranked = [method for method in results.methods if method.average.value is not None]
+    methods = [method for method in results.methods if method.average.value is not None]
+    # Methods without all episodes may be of different ones.
+    ranked = [method for method in methods if method.average.mean is not None]
+    kind = "methods" if len(ranked) == len(methods) else "complete methods"
+    if not ranked and len(methods) > 1:
+        return [f"None of {len(methods)} methods has all its episodes yet, so none is ranked."]
+    ranked = ranked or methods
     ranked.sort(key=lambda method: -(method.average.value or 0))
     if not ranked:
         return []
@@ -203,7 +209,7 @@ def conclude(results: Results, comparisons: Sequence[Comparison]) -> list[str]:
     if equals:
         text += f", as many as {' and '.join(equals)}"
     elif others:
-        text += f", the most of {len(ranked)} methods; next is {others[0].label} with"
+        text += f", the most of {len(ranked)} {kind}; next is {others[0].label} with"
         text += f" {others[0].average.value:.1f} %"
     return [f"{text}."]
 
