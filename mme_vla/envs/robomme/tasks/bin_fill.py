@@ -4,9 +4,9 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import sapien
+from pydantic import NonNegativeInt
 
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Appear, Cue, row, tally
@@ -66,9 +66,10 @@ class BinFill(Task):
 
         dx, y, degrees = values.place("layout.board_offsets", sample_board, size=3)
         self.board = self.add(build_board(self, (BOARD_X + dx, y), math.radians(degrees)))
-        numbers = values("objects.target_numbers", lambda: self._draw_counts(draws))
-        are_counts = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)
-        if not are_counts or len(numbers) != len(SAMPLED_COLOURS) or not any(numbers):
+        numbers = values(
+            "objects.target_numbers", lambda: self._draw_counts(draws), list[NonNegativeInt]
+        )
+        if len(numbers) != len(SAMPLED_COLOURS) or not any(numbers):
             raise values.error(
                 "objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green"
             )
@@ -128,14 +129,14 @@ class BinFill(Task):
 
     def _read_cubes(self) -> None:
         """Add the cubes of the row."""
-        names: Any = self.values("objects.slot_assignment", list)
+        names: list[str] = self.values("objects.slot_assignment", list, list[str])
         count = self.values.count("layout.slots")
-        if not isinstance(names, list) or len(names) != count:
+        if len(names) != count:
             raise self.values.error(
                 "objects.slot_assignment", f"must name a cube for each of the {count} slots"
             )
         for i, name in enumerate(names):
-            colour = str(name).split("_")[0]
+            colour = name.split("_")[0]
             if colour not in SAMPLED_COLOURS:
                 raise self.values.error(
                     f"objects.slot_assignment.{i}",

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import sapien
+from pydantic import FiniteFloat
 
 from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.control import PlanningError
@@ -28,6 +29,7 @@ from mme_vla.envs.robomme.scene.objects import (
 from mme_vla.envs.robomme.scene.placement import Draws, Point, SceneError
 from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up
 from mme_vla.envs.robomme.scene.things import Thing, distance_xy
+from mme_vla.envs.robomme.scene.values import Coordinate
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import end_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
@@ -108,16 +110,11 @@ class InsertPeg(Task):
         """Place and yaw of each peg of the row."""
         values = self.values
         pegs: list[tuple[Point, float]] = []
-        for i, entry in enumerate(values.find("initializations.pegs")):
-            name = f"initializations.pegs.{i}"
-            if not isinstance(entry, list) or len(entry) != 2:
-                raise values.error(name, f"is {entry!r}; expected [[x, y], yaw]")
-            if isinstance(entry[0], list):
-                entry = [*entry[0], entry[1]]
-            x, y, yaw = values.check_place(name, entry, 3)
-            if any(math.dist((x, y), other) < PEG_RADIUS for other, _ in pegs):
-                raise values.error(name, "overlaps another peg")
-            pegs.append(((x, y), yaw))
+        kind = list[tuple[tuple[Coordinate, Coordinate], FiniteFloat]]
+        for i, (place, yaw) in enumerate(values.read("initializations.pegs", kind)):
+            if any(math.dist(place, other) < PEG_RADIUS for other, _ in pegs):
+                raise values.error(f"initializations.pegs.{i}", "overlaps another peg")
+            pegs.append((place, yaw))
         return pegs
 
     def _draw_pegs(self, draws: Draws, box: Point) -> list[tuple[Point, float]]:
