@@ -18,7 +18,7 @@ from annotated_types import Interval, Len
 from pydantic import FiniteFloat
 
 from mme_vla.envs.robomme.scene.placement import Box2D
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import brief, require
 from mme_vla.utils.validation import validated
 
 BOUND = 2.0
@@ -69,8 +69,7 @@ class Values:
         value = self.read(name, kind)
         if value is None:
             value = default
-        if value is None:
-            raise self.error(name, "is missing")
+        self.require(value is not None, name, "is missing")
         return value
 
     def read(self, name: str, kind: Any) -> Any:
@@ -106,8 +105,10 @@ class Values:
         """Indices into a list of `count` entries."""
         kind = list[Annotated[int, Interval(ge=0, le=count - 1)]]
         indices: list[int] = self(name, sample, kind)
-        if distinct and len(set(indices)) < len(indices):
-            raise self.error(name, f"is {brief(indices)}; expected each number once")
+        differ = len(set(indices)) == len(indices)
+        self.require(
+            differ or not distinct, name, f"is {brief(indices)}; expected each number once"
+        )
         return indices
 
     def pairs(self, name: str, count: int) -> list[tuple[int, int]] | None:
@@ -115,8 +116,9 @@ class Values:
         index: Any = Annotated[int, Interval(ge=0, le=count - 1)]
         pairs = self.read(name, list[tuple[index, index]])
         for i, (first, second) in enumerate(pairs or []):
-            if first == second:
-                raise self.error(f"{name}[{i}]", f"is {first} twice; expected different numbers")
+            self.require(
+                first != second, f"{name}[{i}]", f"is {first} twice; expected different numbers"
+            )
         return pairs
 
     def words(self, name: str, sample: Callable[[], list[str]], known: Iterable[str]) -> list[str]:
@@ -148,9 +150,12 @@ class Values:
     def names(self, name: str) -> list[str]:
         """Names of the entries of a part of the row, in order."""
         value = self.find(name)
-        if value is not None and not isinstance(value, Mapping):
-            raise self.error(name, f"is {brief(value)}; expected places by name")
-        return list(value or {})
+        if value is None:
+            return []
+        self.require(
+            isinstance(value, Mapping), name, f"is {brief(value)}; expected places by name"
+        )
+        return list(value)
 
     def count(self, name: str) -> int:
         """Entries of a list of the row; 0 where it has none."""
@@ -172,9 +177,11 @@ class Values:
         else:
             holder[parts[-1]] = _to_json(value)
 
-    def error(self, name: str, problem: str) -> UserError:
-        """What is wrong with a value of the row."""
-        return UserError(f"{self._where}: spec.{name} {problem}.")
+    def require(self, holds: object, name: str, problem: str) -> None:
+        """Refuse the row, naming one of its values and what is wrong with it, unless something
+        holds.
+        """
+        require(holds, f"{self._where}: spec.{name} {problem}.")
 
     def occupy(self, name: str, xy: Any, half: float, yaw: float = 0.0) -> None:
         """Note that an object of a row stands there, a square; refuse one that stands in another.
@@ -189,8 +196,7 @@ class Values:
             return
         box = Box2D.square(np.asarray(xy, float)[:2], half - OVERLAP, yaw)
         for other, occupied in self._occupied:
-            if box.intersects(occupied):
-                raise self.error(name, f"overlaps spec.{other}")
+            self.require(not box.intersects(occupied), name, f"overlaps spec.{other}")
         self._occupied.append((name, box))
 
 

@@ -69,10 +69,11 @@ class BinFill(Task):
         numbers = values(
             "objects.target_numbers", lambda: self._draw_counts(draws), list[NonNegativeInt]
         )
-        if len(numbers) != len(SAMPLED_COLOURS) or not any(numbers):
-            raise values.error(
-                "objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green"
-            )
+        values.require(
+            len(numbers) == len(SAMPLED_COLOURS) and any(numbers),
+            "objects.target_numbers",
+            f"is {numbers}; expected three numbers, not all 0: red, blue, green",
+        )
         self.goal = Counter(dict(zip(SAMPLED_COLOURS, numbers, strict=True)))
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in SAMPLED_COLOURS}
         if values.specified:
@@ -82,8 +83,7 @@ class BinFill(Task):
         for colour in SAMPLED_COLOURS:
             if len(self.cubes[colour]) < self.goal[colour]:
                 problem = f"a {colour} cube for the bin"
-                if values.specified:
-                    raise values.error("objects.slot_assignment", f"lacks {problem}")
+                values.require(not values.specified, "objects.slot_assignment", f"lacks {problem}")
                 raise SceneError(f"BinFill, seed {self.seed}: {problem} finds no place.")
 
     def _draw_counts(self, draws: Draws) -> list[int]:
@@ -131,17 +131,18 @@ class BinFill(Task):
         """Add the cubes of the row."""
         names: list[str] = self.values("objects.slot_assignment", list, list[str])
         count = self.values.count("layout.slots")
-        if len(names) != count:
-            raise self.values.error(
-                "objects.slot_assignment", f"must name a cube for each of the {count} slots"
-            )
+        self.values.require(
+            len(names) == count,
+            "objects.slot_assignment",
+            f"must name a cube for each of the {count} slots",
+        )
         for i, name in enumerate(names):
             colour = name.split("_")[0]
-            if colour not in SAMPLED_COLOURS:
-                raise self.values.error(
-                    f"objects.slot_assignment.{i}",
-                    f"is {name!r}; expected {', '.join(SAMPLED_COLOURS)}",
-                )
+            self.values.require(
+                colour in SAMPLED_COLOURS,
+                f"objects.slot_assignment.{i}",
+                f"is {name!r}; expected {', '.join(SAMPLED_COLOURS)}",
+            )
             self._add_cube(colour, self.values.place(f"layout.slots.{i}", list, size=3))
 
     def _add_cube(self, colour: str, place: Sequence[float]) -> None:

@@ -77,8 +77,7 @@ class InsertPeg(Task):
             xy = (0.2, 0.2 * (i - 1))
             peg = build_peg(self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, xy, 0)
             self.pegs.append(self.add(peg))
-        if not self.pegs:
-            raise self.values.error("initializations.pegs", "is missing or empty")
+        self.values.require(self.pegs, "initializations.pegs", "is missing or empty")
         self.peg = self.pegs[0]
         self.wrong_ends = [end for peg in self.pegs[1:] for end in (peg.head, peg.tail)]
         self._disc = build_highlight(self, "disc", *MARK, APERTURE_COLOUR)
@@ -112,8 +111,8 @@ class InsertPeg(Task):
         pegs: list[tuple[Point, float]] = []
         kind = list[tuple[tuple[Coordinate, Coordinate], FiniteFloat]]
         for i, (place, yaw) in enumerate(values.read("initializations.pegs", kind)):
-            if any(math.dist(place, other) < PEG_RADIUS for other, _ in pegs):
-                raise values.error(f"initializations.pegs.{i}", "overlaps another peg")
+            clear = all(math.dist(place, other) >= PEG_RADIUS for other, _ in pegs)
+            values.require(clear, f"initializations.pegs.{i}", "overlaps another peg")
             pegs.append((place, yaw))
         return pegs
 

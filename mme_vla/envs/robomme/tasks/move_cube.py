@@ -107,8 +107,8 @@ class MoveCube(Task):
         """Place and yaw [3] of the cube in the video (`demo`) or in the execution."""
         name = f"layout.{part}.cube_pose"
         x, y, yaw = self.values.place(name, lambda: self._draw_cube(draws, goal, avoid), size=3)
-        if self.values.specified and math.dist((x, y), goal) <= H:
-            raise self.values.error(name, f"overlaps spec.layout.{part}.goal_xy")
+        clear = not self.values.specified or math.dist((x, y), goal) > H
+        self.values.require(clear, name, f"overlaps spec.layout.{part}.goal_xy")
         return [x, y, yaw]
 
     def _draw_cube(

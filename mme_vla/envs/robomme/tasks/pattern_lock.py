@@ -62,10 +62,11 @@ class PatternLock(Task):
             self.discs.append(self.add(build_disc(self, name, 0.02, 0.01, "gray", (x, y))))
         nodes = self.values.indices("actions.path_nodes", lambda: self._draw_path(draws, n), n * n)
         steps = [np.subtract(divmod(a, n), divmod(b, n)) for a, b in itertools.pairwise(nodes)]
-        if len(nodes) < 2 or any(np.abs(step).max() > 1 for step in steps):
-            raise self.values.error(
-                "actions.path_nodes", f"is {nodes}; expected a path over neighbours, {n} a row"
-            )
+        self.values.require(
+            steps and all(np.abs(step).max() <= 1 for step in steps),
+            "actions.path_nodes",
+            f"is {nodes}; expected a path over neighbours, {n} a row",
+        )
         self.path = [self.discs[i] for i in nodes]
         self._marks = [
             build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(n * n)

@@ -50,8 +50,7 @@ class PickHighlight(Task):
             lambda: draws.permutation(count)[: GOALS[self.difficulty]],
             count,
         )
-        if not goals:
-            raise self.values.error("objects.highlight_ids", "is empty; expected at least one cube")
+        self.values.require(goals, "objects.highlight_ids", "is empty; expected at least one cube")
         self.goal_cubes = [self.cubes[i] for i in goals]
         self._discs = [
             build_highlight(self, f"highlight_{i}", 0.05, 0.001) for i in range(len(goals))

@@ -26,10 +26,11 @@ class VideoPlaceButton(VideoPlace):
         self._visited_before = [0, *self._further_visits("before")]
         self._visited_after = [1, *self._further_visits("after")]
         goal = values.find("actions.target_target_id")
-        if goal is not None and goal != self.targets.index(self.goal_target):
-            raise values.error(
-                "actions.target_target_id", f"is {goal}; the other values give another target"
-            )
+        values.require(
+            goal in (None, self.targets.index(self.goal_target)),
+            "actions.target_target_id",
+            f"is {goal}; the other values give another target",
+        )
 
     def _further_visits(self, when: str) -> list[int]:
         name = f"objects.extra_place_target_ids.{when}"

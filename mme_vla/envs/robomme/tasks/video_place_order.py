@@ -33,8 +33,8 @@ class VideoPlaceOrder(VideoPlace):
 
         name = "objects.visit_ids_by_object"
         rows = max(values.count(name), 1)
-        if rows != len(self.demonstrated):
-            raise values.error(name, f"has {rows} lists for {len(self.demonstrated)} cubes")
+        cubes = len(self.demonstrated)
+        values.require(rows == cubes, name, f"has {rows} lists for {cubes} cubes")
         self._visits: list[tuple[Cube, list[Disc]]] = []
         total = 0
         for i, cube in enumerate(self.demonstrated):

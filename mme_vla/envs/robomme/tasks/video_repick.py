@@ -88,17 +88,17 @@ class VideoRepick(Task):
             swaps = len(initiators)
         self.initiators = [self.cubes[i] for i in initiators]
         self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
-        if self.swap_count != swaps:
-            raise values.error(
-                "objects.n_swaps", f"is {self.swap_count}, and actions has {swaps} swaps"
-            )
+        values.require(
+            self.swap_count == swaps,
+            "objects.n_swaps",
+            f"is {self.swap_count}, and actions has {swaps} swaps",
+        )
 
     def _read_cubes(self, draws: Draws) -> None:
         """Add the row's cubes, all of one colour or each of its own."""
         values = self.values
         count = values.count("layout.cubes")
-        if count < 1:
-            raise values.error("layout.cubes", "is missing or empty")
+        values.require(count, "layout.cubes", "is missing or empty")
         one_colour = values.find("objects.color_rgb") is not None
         for i in range(count):
             colour: str | RGB

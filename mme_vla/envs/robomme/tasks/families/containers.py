@@ -105,10 +105,11 @@ class OuterContainers:
             return
         indices = values.indices(f"{part}.cube_bins", list, len(self.containers))
         colours = values.words(f"{part}.cube_colors", list, COLOURS)
-        if len(colours) != len(indices):
-            raise values.error(
-                f"{part}.cube_colors", f"has {len(colours)} colours for {len(indices)} cubes"
-            )
+        values.require(
+            len(colours) == len(indices),
+            f"{part}.cube_colors",
+            f"has {len(colours)} colours for {len(indices)} cubes",
+        )
         for j, (i, colour) in enumerate(zip(indices, colours, strict=True)):
             container = self.containers[i]
             name = f"distractor_cube_{j}_{colour}"
@@ -131,10 +132,11 @@ class ContainerTask(Task):
     def check_count(self) -> None:
         """Refuse a row with fewer containers than hidden cubes."""
         count = len(self.containers)
-        if count < MOST_PICKS:
-            raise self.values.error(
-                "layout.bins", f"has {count} containers; expected at least {MOST_PICKS}"
-            )
+        self.values.require(
+            count >= MOST_PICKS,
+            "layout.bins",
+            f"has {count} containers; expected at least {MOST_PICKS}",
+        )
 
     def hide_cubes(self) -> list[Cube]:
         """Put a small cube of each colour under its container."""
@@ -333,19 +335,21 @@ class UnmaskSwap(ContainerTask):
         self.check_count()
         self.colours = sample_colours(self, draws, UNMASK_COLOURS)
         over = values.indices("objects.selected", lambda: draws.permutation(3), count)
-        if len(over) != len(self.colours):
-            raise values.error(
-                "objects.selected", f"has {len(over)} containers for {len(self.colours)} cubes"
-            )
+        values.require(
+            len(over) == len(self.colours),
+            "objects.selected",
+            f"has {len(over)} containers for {len(self.colours)} cubes",
+        )
         self.over_cubes = [self.containers[i] for i in over]
         self.cubes = self.hide_cubes()
         self._plan_swaps(draws, count)
         self.outer = OuterContainers(self)
         name = "actions.distractor_swap_pairs"
         self.outer_pairs = values.pairs(name, len(self.outer.containers)) or []
-        if len(self.outer_pairs) > self.swap_count:
-            problem = f"has {len(self.outer_pairs)} swaps, more than objects.n_swaps"
-            raise values.error(name, problem)
+        swaps = len(self.outer_pairs)
+        values.require(
+            swaps <= self.swap_count, name, f"has {swaps} swaps, more than objects.n_swaps"
+        )
 
     def _plan_swaps(self, draws: Draws, count: int) -> None:
         """Which containers change places: both of a row's pair, or an initiator and whichever is
@@ -368,10 +372,11 @@ class UnmaskSwap(ContainerTask):
             self.initiators = [self.containers[i] for i in initiators]
             swaps = len(initiators)
         self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
-        if self.swap_count != swaps:
-            raise values.error(
-                "objects.n_swaps", f"is {self.swap_count}, and {name} has {swaps} swaps"
-            )
+        values.require(
+            self.swap_count == swaps,
+            "objects.n_swaps",
+            f"is {self.swap_count}, and {name} has {swaps} swaps",
+        )
 
     def _draw_initiators(self, draws: Draws, count: int) -> list[int]:
         draws.integer(0, count)  # part of the official stream, without effect

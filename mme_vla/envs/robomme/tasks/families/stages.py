@@ -99,10 +99,11 @@ def _cube_names(env: Task, part: str) -> list[str]:
     """Names such as `red_0` of the cubes in a part of the row."""
     names = env.values.names(part)
     for name in names:
-        if name.split("_")[0] not in COLOURS:
-            raise env.values.error(
-                f"{part}.{name}", f"has an unknown colour; expected one of {', '.join(COLOURS)}"
-            )
+        env.values.require(
+            name.split("_")[0] in COLOURS,
+            f"{part}.{name}",
+            f"has an unknown colour; expected one of {', '.join(COLOURS)}",
+        )
     return names
 
 
@@ -189,10 +190,11 @@ def check_colour(env: Task, colour: str | RGB) -> None:
     give.
     """
     stated = env.values.find("objects.target_color")
-    if stated not in (None, colour):
-        raise env.values.error(
-            "objects.target_color", f"is {stated!r}; the other values give {colour!r}"
-        )
+    env.values.require(
+        stated in (None, colour),
+        "objects.target_color",
+        f"is {stated!r}; the other values give {colour!r}",
+    )
 
 
 def delay(env: Task) -> int:
