@@ -205,7 +205,7 @@ class Task(Stage):
         return VisibleFact(str(count), {f"count of {subtasks[i].choice}"}, replaces=True)
 
     def flip_fact(self) -> dict[str, Any] | None:
-        """The values (`values.spec`) of a scene that differs from this one in a single fact: the
+        """The values (`values.changed`) of a scene that differs from this one in a single fact: the
         goal, every place and what is to be done look the same once the fact has been shown.
 
         By default None: what the robot itself did, such as a count, is no value of a scene.

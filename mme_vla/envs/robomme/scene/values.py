@@ -177,6 +177,13 @@ class Values:
         else:
             holder[parts[-1]] = _to_json(value)
 
+    def changed(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """A copy of all values in which these are others, by their names."""
+        copied = Values(self.spec)
+        for name, value in values.items():
+            copied.note(name, value)
+        return copied.spec
+
     def require(self, holds: object, name: str, problem: str) -> None:
         """Refuse the row, naming one of its values and what is wrong with it, unless something
         holds.

@@ -5,7 +5,6 @@ same with that peg.
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from copy import deepcopy
 from functools import partial
 from typing import Any
 
@@ -136,10 +135,8 @@ class InsertPeg(Task):
         """The first two pegs, of which the video takes one, change places."""
         if len(self.pegs) < 2:
             return None
-        values = deepcopy(self.values.spec)
-        pegs = values["initializations"][-1]["pegs"]
-        pegs[0], pegs[1] = pegs[1], pegs[0]
-        return values
+        first, second, *others = self.values.find("initializations.pegs")
+        return self.values.changed({"initializations.pegs": [second, first, *others]})
 
     def candidates(self) -> Candidates | None:
         """The pegs, before one is grasped."""

@@ -4,7 +4,6 @@ same manner.
 
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -138,10 +137,8 @@ class MoveCube(Task):
 
     def flip_fact(self) -> dict[str, Any]:
         """The video takes the peg instead of the cube, or the cube instead of the peg."""
-        values = deepcopy(self.values.spec)
         manner = "grasp" if self.manner == "hook" else "hook"
-        values["initializations"][-1]["way_idx"] = MANNERS.index(manner)
-        return values
+        return self.values.changed({"initializations.way_idx": MANNERS.index(manner)})
 
     def candidates(self) -> Candidates | None:
         """The peg and the cube: what the manner of the video begins with."""

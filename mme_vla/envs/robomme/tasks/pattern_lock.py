@@ -5,7 +5,6 @@ again.
 import itertools
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from functools import partial
 from typing import Any
 
@@ -97,9 +96,7 @@ class PatternLock(Task):
             goal = draws.integer(0, n * n)
             other = search(draws, n, nodes[0], goal, {nodes[0]}) or []
             if len(other) == len(nodes) and other[1] != nodes[1]:
-                values = deepcopy(self.values.spec)
-                values["actions"]["path_nodes"] = other
-                return values
+                return self.values.changed({"actions.path_nodes": other})
         return None
 
     def candidates(self) -> Candidates | None:

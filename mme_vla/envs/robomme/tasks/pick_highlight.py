@@ -3,7 +3,6 @@ pick up just those.
 """
 
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 from mme_vla.envs.facts import Candidates, VisibleFact
@@ -89,9 +88,7 @@ class PickHighlight(Task):
         others = [i for i, cube in enumerate(self.cubes) if cube in self.other_cubes]
         if len(others) < count:
             return None
-        values = deepcopy(self.values.spec)
-        values["objects"]["highlight_ids"] = others[:count]
-        return values
+        return self.values.changed({"objects.highlight_ids": others[:count]})
 
     def candidates(self) -> Candidates | None:
         """Any highlighted cube that has not been picked up is correct."""

@@ -4,7 +4,6 @@ route.
 
 import itertools
 import math
-from copy import deepcopy
 from functools import partial
 from typing import Any, Literal
 
@@ -110,9 +109,7 @@ class RouteStick(Task):
         mirrored = [2 * route[0] - i for i in route]
         if not all(0 <= i < len(self.discs) for i in mirrored):
             return None
-        values = deepcopy(self.values.spec)
-        values["actions"]["route"] = mirrored
-        return values
+        return self.values.changed({"actions.route": mirrored})
 
     def candidates(self) -> Candidates | None:
         """The discs beside the one that the next move starts from."""

@@ -3,7 +3,6 @@ now.
 """
 
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 from mme_vla.envs.facts import VisibleFact
@@ -155,9 +154,8 @@ class VideoRepick(Task):
         count = len(self.cubes)
         if count < 2:
             return None
-        values = deepcopy(self.values.spec)
-        values["objects"]["target"] = (self.cubes.index(self.cube) + 1) % count
-        return values
+        following = (self.cubes.index(self.cube) + 1) % count
+        return self.values.changed({"objects.target": following})
 
     def cues(self) -> list[Cue]:
         def left() -> int:

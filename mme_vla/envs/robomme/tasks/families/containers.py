@@ -3,7 +3,6 @@ them down.
 """
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
@@ -280,10 +279,8 @@ class Unmask(ContainerTask):
 
     def flip_fact(self) -> dict[str, Any]:
         """The first two containers change places, and their cubes with them."""
-        values = deepcopy(self.values.spec)
-        places = values["layout"]["bins"]
-        places[0], places[1] = places[1], places[0]
-        return values
+        first, second, *others = self.values.find("layout.bins")
+        return self.values.changed({"layout.bins": [second, first, *others]})
 
     def start_episode(self, draws: Draws) -> None:
         self.cover = Cover(self.containers, self.parking_group("inner"), self.contents)
@@ -390,10 +387,8 @@ class UnmaskSwap(ContainerTask):
 
     def flip_fact(self) -> dict[str, Any]:
         """The first two cubes change places: each is under the other's container."""
-        values = deepcopy(self.values.spec)
-        over = values["objects"]["selected"]
-        over[0], over[1] = over[1], over[0]
-        return values
+        first, second, *others = self.values.find("objects.selected")
+        return self.values.changed({"objects.selected": [second, first, *others]})
 
     @property
     def swapped_after(self) -> int:
