@@ -12,9 +12,8 @@ from mme_vla.envs.robomme.scene.motions import (
     Cue,
     Swap,
     active_motions,
-    planned_swaps,
     row,
-    sequential_swaps,
+    swaps_in_turn,
     tally,
     under,
 )
@@ -34,6 +33,7 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     press_choice,
     put_down,
     put_down_choice,
+    read_swaps,
     wait,
 )
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
@@ -79,19 +79,8 @@ class VideoRepick(Task):
         count = len(self.cubes)
         self.cube = self.cubes[values.integer("objects.target", lambda: target, most=count - 1)]
         self.wrong_cubes = [cube for cube in self.cubes if cube is not self.cube]
-        self.pairs = values.pairs("actions.swap_pairs", count)
-        if self.pairs is not None:
-            swaps = len(self.pairs)
-        else:
-            initiators = values.indices("actions.swap_initiators", lambda: initiators, count)
-            swaps = len(initiators)
-        self.initiators = [self.cubes[i] for i in initiators]
-        self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
-        values.require(
-            self.swap_count == swaps,
-            "objects.n_swaps",
-            f"is {self.swap_count}, and actions has {swaps} swaps",
-        )
+        self.swapped = read_swaps(self, self.cubes, lambda: initiators)
+        self.swap_count = len(self.swapped)
 
     def _read_cubes(self, draws: Draws) -> None:
         """Add the row's cubes, all of one colour or each of its own."""
@@ -142,10 +131,7 @@ class VideoRepick(Task):
 
     def before_physics(self, k: int) -> None:
         if self._swaps_due and not self.swaps:
-            if self.pairs is not None:
-                self.swaps = planned_swaps(self.pairs, self.cubes, start=k)
-            else:
-                self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
+            self.swaps = swaps_in_turn(self.swapped, self.cubes, start=k)
             self.motions = [*self.swaps]
         super().before_physics(k)
 

@@ -17,8 +17,7 @@ from mme_vla.envs.robomme.scene.motions import (
     Hide,
     Swap,
     active_motions,
-    planned_swaps,
-    sequential_swaps,
+    swaps_in_turn,
     under,
 )
 from mme_vla.envs.robomme.scene.objects import (
@@ -40,7 +39,7 @@ from mme_vla.envs.robomme.scene.placement import (
     draw_container,
 )
 from mme_vla.envs.robomme.scene.predicates import container_picked_up, container_put_down
-from mme_vla.envs.robomme.tasks.families.stages import sample_colours
+from mme_vla.envs.robomme.tasks.families.stages import read_swaps, sample_colours
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 
@@ -339,40 +338,20 @@ class UnmaskSwap(ContainerTask):
         )
         self.over_cubes = [self.containers[i] for i in over]
         self.cubes = self.hide_cubes()
-        self._plan_swaps(draws, count)
-        self.outer = OuterContainers(self)
-        name = "actions.distractor_swap_pairs"
-        self.outer_pairs = values.pairs(name, len(self.outer.containers)) or []
-        swaps = len(self.outer_pairs)
-        values.require(
-            swaps <= self.swap_count, name, f"has {swaps} swaps, more than objects.n_swaps"
-        )
-
-    def _plan_swaps(self, draws: Draws, count: int) -> None:
-        """Which containers change places: both of a row's pair, or an initiator and whichever is
-        nearest then.
-        """
-        values = self.values
         self.swap_steps = values.integer(
             "actions.swap_window.duration_steps", lambda: SWAP_STEPS, least=1
         )
-        name = "actions.swap_pairs"
-        self.pairs = values.pairs(name, count)
-        self.initiators: list[Container] = []
-        if self.pairs is not None:
-            swaps = len(self.pairs)
-        else:
-            name = "actions.swap_initiators"
-            initiators = values.indices(
-                name, lambda: self._draw_initiators(draws, count), count, distinct=False
-            )
-            self.initiators = [self.containers[i] for i in initiators]
-            swaps = len(initiators)
-        self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
+        self.swapped = read_swaps(
+            self, self.containers, lambda: self._draw_initiators(draws, count), distinct=False
+        )
+        self.swap_count = len(self.swapped)
+        self.outer = OuterContainers(self)
+        outer = self.outer.containers
+        name = "actions.distractor_swap_pairs"
+        self.outer_swapped = [(outer[a], outer[b]) for a, b in values.pairs(name, len(outer)) or []]
+        swaps = len(self.outer_swapped)
         values.require(
-            self.swap_count == swaps,
-            "objects.n_swaps",
-            f"is {self.swap_count}, and {name} has {swaps} swaps",
+            swaps <= self.swap_count, name, f"has {swaps} swaps, more than objects.n_swaps"
         )
 
     def _draw_initiators(self, draws: Draws, count: int) -> list[int]:
@@ -401,10 +380,7 @@ class UnmaskSwap(ContainerTask):
     def start_episode(self, draws: Draws) -> None:
         inner, outer = self.containers, self.outer.containers
         start, steps, end = COVER_STEPS, self.swap_steps, self.swapped_after
-        if self.pairs is None:
-            swaps = sequential_swaps(self.initiators, inner, start, steps)
-        else:
-            swaps = planned_swaps(self.pairs, inner, start, steps)
+        swaps = swaps_in_turn(self.swapped, inner, start, steps)
         cover = Cover(inner, self.parking_group("inner"), self.contents)
         pairs = list(zip(self.cubes, self.over_cubes, strict=True))
         self.visible_motions: list[Cover | Swap] = [cover, *swaps]
@@ -412,7 +388,7 @@ class UnmaskSwap(ContainerTask):
             cover,
             Cover(outer, self.parking_group("outer")),
             *swaps,
-            *planned_swaps(self.outer_pairs, outer, start, steps),
+            *swaps_in_turn(self.outer_swapped, outer, start, steps),
             Hide(pairs, start, end, self.parking_group("inner cubes")),
             Hide(self.outer.hidden, start, end, self.parking_group("outer cubes")),
         ]

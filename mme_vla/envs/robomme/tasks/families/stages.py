@@ -197,6 +197,35 @@ def check_colour(env: Task, colour: str | RGB) -> None:
     )
 
 
+def read_swaps[T: Thing](
+    env: Task, things: Sequence[T], sample: Callable[[], list[int]], distinct: bool = True
+) -> list[tuple[T, T | None]]:
+    """The swaps in order, as `swaps_in_turn` takes them: both objects of the row's pairs, or
+    initiators alone, whose partner is whichever is nearest then.
+
+    Args:
+        things: the objects that change places.
+        sample: indices of the initiators.
+        distinct: each object begins one swap at most.
+    """
+    values, count = env.values, len(things)
+    swaps: list[tuple[T, T | None]] = []
+    name = "actions.swap_pairs"
+    pairs = values.pairs(name, count)
+    if pairs is not None:
+        for first, second in pairs:
+            swaps.append((things[first], things[second]))
+    else:
+        name = "actions.swap_initiators"
+        for i in values.indices(name, sample, count, distinct):
+            swaps.append((things[i], None))
+    stated = values.integer("objects.n_swaps", lambda: len(swaps))
+    values.require(
+        stated == len(swaps), "objects.n_swaps", f"is {stated}, and {name} has {len(swaps)} swaps"
+    )
+    return swaps
+
+
 def delay(env: Task) -> int:
     """Steps more between what is shown and the execution: a dial, or a value of the row."""
     turned = env.turned("delay")
