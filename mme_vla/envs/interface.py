@@ -28,7 +28,6 @@ from mme_vla.envs.observations import (
     RenderRequest,
     as_lists,
     frame_keys,
-    observation_space,
 )
 from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 from mme_vla.envs.robomme.robot.control import PlanningError
@@ -153,7 +152,6 @@ class RoboMMEEnv(gymnasium.Env):
         self.render_mode = "rgb_array" if render else None
         self.action_space = self._space.space(task.stick)
         self._keys = frame_keys(self.include, render)
-        self.observation_space = observation_space(self._keys)
         self._render = render
         self._task: Task | None = task
         self._muted = True
