@@ -109,12 +109,17 @@ class Variant:
             " none.",
         )
         if self.dial:
-            dials = [dial for dial, tasks in DIALS.items() if task in tasks]
+            dials = dials_of(task)
             require(
                 self.dial in dials,
                 f"{task} has no dial {self.dial!r}; it has {', '.join(dials) or 'none'}."
                 f" {self.dial} is for {', '.join(DIALS[self.dial])}.",
             )
+
+
+def dials_of(task: str) -> list[str]:
+    """The dials of a task."""
+    return [dial for dial, tasks in DIALS.items() if task in tasks]
 
 
 def read_variant(split: str) -> Variant | None:

@@ -54,7 +54,6 @@ class MoveCube(Task):
     """
 
     shared_draws = True
-    dials = frozenset({"delay"})
 
     def build(self, draws: Draws) -> None:
         for _ in range(2):

@@ -48,7 +48,6 @@ class PatternLock(Task):
     """Rows of the grid run along x, columns along y."""
 
     stick = True
-    dials = frozenset({"path"})
 
     def build(self, draws: Draws) -> None:
         n = GRID[self.difficulty]

@@ -37,7 +37,6 @@ class PickHighlight(Task):
     """Success needs every highlighted cube to have been picked up once, in any order."""
 
     latch_failure = True
-    dials = frozenset({"distractors"})
 
     def build(self, draws: Draws) -> None:
         self.button = add_button(self, draws, (-0.2, 0))

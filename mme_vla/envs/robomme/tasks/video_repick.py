@@ -54,7 +54,6 @@ class VideoRepick(Task):
     shared_draws = True
     latch_failure = True
     recovery_sampled_per_episode = True
-    dials = frozenset({"count", "delay"})
     fact_choices = "a"
 
     def plan(self, draws: Draws) -> None:

@@ -295,8 +295,6 @@ PICKS = {"easy": (1, 2), "medium": (1, 1), "hard": (2, 2)}
 class UnmaskSwap(ContainerTask):
     """Where the containers stand, and what comes before the picks, is for the task to say."""
 
-    dials = frozenset({"swaps"})
-
     def plan(self, draws: Draws) -> None:
         low, high = SWAPS[self.difficulty]
         self.swap_count = draws.integer(low, high + 1)

@@ -59,7 +59,6 @@ class VideoPlace(Task):
     places.
     """
 
-    dials = frozenset({"delay"})
     fact_choices = "bc"
     spot_radius: ClassVar[float]
     """How far the spot where the video puts the cube at its end stays from the edge of
