@@ -57,26 +57,20 @@ def add_container(
     region: Region,
     avoid: Sequence[Avoid],
     gap: float,
-) -> Container | None:
-    """Add a container at the row's place, or at a random one; None where it finds none."""
-    if env.values.specified:
-        return read_container(env, name, value)
-    sample = draw_container(draws, region, avoid, gap=gap)
-    if sample is None:
-        return None
-    (x, y), degrees = sample
-    place = [float(x), float(y), degrees]
-    env.values.note(value, place)
-    return _put_container(env, name, value, place)
+) -> Container:
+    """Add a container at the place that the row gives as `value`, or at a random one.
 
+    Raises:
+        SceneError: no place is free.
+    """
 
-def read_container(env: Task, name: str, value: str) -> Container:
-    """Add a container at the row's place."""
-    return _put_container(env, name, value, env.values.place(value, list, size=3))
+    def sample() -> list[float]:
+        place = draw_container(draws, region, avoid, gap=gap)
+        if place is None:
+            raise SceneError(f"{type(env).__name__}, seed {env.seed}: {name} finds no place.")
+        return [*place[0], place[1]]
 
-
-def _put_container(env: Task, name: str, value: str, place: Sequence[float]) -> Container:
-    x, y, degrees = place
+    x, y, degrees = env.values.place(value, sample, size=3)
     yaw = float(np.deg2rad(degrees))
     env.values.occupy(value, (x, y), CONTAINER_OUTER / 2, yaw)
     return env.add(build_container(env, name, (x, y), yaw))
@@ -97,8 +91,11 @@ class OuterContainers:
         part = "objects.distractors"
         if values.find(f"{part}.public") is not None:
             part = f"{part}.public"
+        table = Region((0, 0), WIDER_HALF)  # without effect: the row has their places
         for i in range(values.count(f"{part}.bins")):
-            self.containers.append(read_container(env, f"distractor_bin_{i}", f"{part}.bins.{i}"))
+            name = f"distractor_bin_{i}"
+            container = add_container(env, env.draws, name, f"{part}.bins.{i}", table, [], H)
+            self.containers.append(container)
         if not self.containers:
             return
         indices = values.indices(f"{part}.cube_bins", list, len(self.containers))
@@ -260,16 +257,13 @@ class Unmask(ContainerTask):
         if self.values.specified:
             count = self.values.count(part)
         for i in range(count):
-            container = add_container(
-                self,
-                draws,
-                f"container_{len(self.containers)}",
-                f"{part}.{i}",
-                Region((0, 0), half),
-                [*avoid, *self.containers],
-                gap,
-            )
-            if container is None:
+            name = f"container_{len(self.containers)}"
+            taken = [*avoid, *self.containers]
+            try:
+                container = add_container(
+                    self, draws, name, f"{part}.{i}", Region((0, 0), half), taken, gap
+                )
+            except SceneError:
                 return
             self.containers.append(container)
 
@@ -323,8 +317,6 @@ class UnmaskSwap(ContainerTask):
             container = add_container(
                 self, draws, f"container_{i}", f"layout.bins.{i}", region, taken, H
             )
-            if container is None:
-                raise SceneError(f"No place for container {i} with seed {self.seed}.")
             self.containers.append(container)
         self.check_count()
         self.colours = sample_colours(self, draws, UNMASK_COLOURS)
