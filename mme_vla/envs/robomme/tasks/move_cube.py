@@ -184,7 +184,7 @@ class MoveCube(Task):
             SubTask(
                 "Hook the cube to the target with the peg",
                 done=self._pushed,
-                run=self._demonstrate_hook,
+                run=self._demonstrate_move,
                 grounded="Hook the cube at <> to the target at <> with the peg",
                 targets=[self.cube, self.target],
                 choice="b",
@@ -192,20 +192,11 @@ class MoveCube(Task):
             ),
         ]
 
-    def _demonstrate_hook(self, demo: Demonstrator) -> None:
-        demo.hook(self.cube, self.target)
-        tries = MORE_TRIES if self.second_tries else 0
-        for _ in range(tries):
-            if not self._pushed():
-                demo.withdraw()
-                demo.grasp_peg(self.peg, "tail")
-                demo.hook(self.cube, self.target)
-
     def _push(self, video: bool) -> list[SubTask]:
         push = SubTask(
             "Close the gripper and push the cube to the target",
             done=self._pushed,
-            run=self._demonstrate_push,
+            run=self._demonstrate_move,
             grounded="Close the gripper and push the cube at <> to the target at <>",
             failed=lambda: self._holds_cube() or self._holds_peg(),
             targets=[self.cube, self.target],
@@ -215,13 +206,17 @@ class MoveCube(Task):
         )
         return [push]
 
-    def _demonstrate_push(self, demo: Demonstrator) -> None:
-        demo.push(self.cube, self.target)
+    def _demonstrate_move(self, demo: Demonstrator) -> None:
+        """Hook or push as the benchmark does, and again where the cube did not stay."""
+        move = demo.hook if self.manner == "hook" else demo.push
+        move(self.cube, self.target)
         tries = MORE_TRIES if self.second_tries else 0
         for _ in range(tries):
             if not self._pushed():
                 demo.withdraw()
-                demo.push(self.cube, self.target)
+                if self.manner == "hook":
+                    demo.grasp_peg(self.peg, "tail")
+                move(self.cube, self.target)
 
     def _grasp(self, video: bool) -> list[SubTask]:
         return [
