@@ -141,18 +141,13 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
     return row | {"where": where}
 
 
-class SceneOptions(TypedDict, total=False):
-    """Keyword arguments of `make_env` that choose a scene."""
+class TaskOptions(TypedDict, total=False):
+    """Keyword arguments of a task that make a scene (`envs/task.py`)."""
 
     seed: int
     difficulty: str | None
     recovery: str | None
     row: Mapping[str, Any]
-
-
-class TaskOptions(SceneOptions, total=False):
-    """Keyword arguments of a task that make a scene (`envs/task.py`)."""
-
     in_view: bool
     stress: Mapping[str, int]
 

@@ -80,7 +80,7 @@ class BenchmarkEnvBuilder:
                 "gui_render=True: these environments open no window. Leave it out, and use"
                 " render()."
             )
-        check_names(env_id, action_space, None, None)
+        check_names(env_id, action_space)
         self.env_id, self.dataset, self.action_space, self.max_steps = (
             env_id,
             dataset,
