@@ -53,9 +53,11 @@ def pick_cube() -> Callable[[], object]:
 
 
 def library_env(task: str) -> tuple[Any, Callable[[], object]]:
-    """A task's environment, and one step of it; no conditioning video is run first."""
+    """A task's environment, and one step of it; no image of its conditioning video is rendered."""
     env = make_env(task, seed=1, difficulty="hard", max_steps=100_000)
-    env.reset(options={"video": False})
+    env.render_request = observations.RenderRequest({}, now=(), grounded=False)
+    env.reset()
+    env.render_request = None
     action = HOLD[:7] if env.action_space.shape == (7,) else HOLD
     return env, lambda: env.step(action)
 
@@ -72,7 +74,7 @@ class Parts:
             sensor.capture = self._timed("rendering", sensor.capture)
         # Rendering continues in the background until an image is read: this is the other part of
         # its time.
-        observations._read_texture = self._timed("waiting for images", observations._read_texture)
+        observations.read_images = self._timed("waiting for images", observations.read_images)
 
     def _timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:

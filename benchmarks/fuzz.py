@@ -42,7 +42,6 @@ from mme_vla.cli.weights import convert as convert_weights
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.envs import metadata
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import RECORDS, read_records, read_run
 from mme_vla.extras.play.game import Option
@@ -574,11 +573,6 @@ def read_replies(folder: Path) -> object:
         raise UserError(str(error)) from None
 
 
-def read_metadata(folder: Path) -> object:
-    """Every episode."""
-    return tuple(map(repr, metadata.episodes("PickXtimes", "test", folder)))
-
-
 def _always(valid: object, result: object) -> bool:
     return True
 
@@ -596,7 +590,6 @@ TARGETS = {
     "kept-answers": Target(artefacts.write_answers, artefacts.read_answers),
     "answers": Target(write_replies, read_replies, _always),
     "rows": Target(artefacts.write_rows, artefacts.read_rows),
-    "metadata": Target(artefacts.write_metadata, read_metadata, _always),
 }
 """Kind of file → how to make one and how the library reads it."""
 

@@ -15,7 +15,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.errors import UserError, counted, require
+from mme_vla.errors import SceneError, UserError, counted, require
 from mme_vla.utils import read_text
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
 from mme_vla.utils.pages import render
@@ -84,7 +84,7 @@ def main(cfg: DictConfig) -> None:
     require_simulator()
     folder.mkdir(parents=True, exist_ok=True)
     entries = []
-    with progress("show", len(specs), unit="tasks") as advance:
+    with progress("show", len(specs), unit="episodes") as advance:
         for spec in specs:
             env, views = demonstrated(spec)
             several = sum(other.task == spec.task for other in specs) > 1
@@ -96,16 +96,16 @@ def main(cfg: DictConfig) -> None:
     names = list(dict.fromkeys(task for task, _, _ in entries))
     title = counted(len(names), "task") if len(names) > 1 else names[0]
     page.write_text(render("gallery.md", title=title, entries=entries))
-    print(f"{page}: {counted(len(entries), 'task')}.")
+    print(f"{page}: {counted(len(entries), 'episode')}.")
 
 
 def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Tile]]:
     """The first seed from the episode's on whose demonstration succeeds, as the official episodes
     were found.
     """
-    from mme_vla.envs.robomme.scene.placement import SceneError
-
-    for seed in range(spec.seed, spec.seed + (1 if spec.row else 100)):
+    # A row describes one scene: another seed would be another row.
+    seeds = range(spec.seed, spec.seed + (100 if spec.row is None else 1))
+    for seed in seeds:
         try:
             env = make_task(spec.task, render=True, **spec.options | {"seed": seed})
         except SceneError:
@@ -114,6 +114,8 @@ def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Tile]]:
         if success:
             return env, views
         env.close()
-    raise UserError(
-        f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}."
-    )
+    if spec.row is None:
+        tried = f"seeds {seeds[0]} … {seeds[-1]}"
+    else:
+        tried = f"the values of its scene (seed {spec.seed})"
+    raise UserError(f"{spec.task} episode {spec.episode}: no demonstration succeeded for {tried}.")

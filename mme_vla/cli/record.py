@@ -243,48 +243,44 @@ def main(cfg: DictConfig) -> None:
     )
     places = ", ".join(map(str, recording_plan.places))
     work = _work_folder(run.output)
-    if not recording_plan.missing(options) and not work.exists():
-        print(f"{places}: {counted(len(jobs), 'episode')}, all there already.")
-        if run.coverage is not None:
-            require_simulator()
-            report_coverage(run.tasks, recording_plan, Path(run.coverage), run.workers)
-        return
-    require_simulator()
-    with FolderLock(work, "recording"):
-        _claim(work, [job.plan for job in jobs])
-        # asked again: another process may have finished it meanwhile
-        missing = recording_plan.missing(options)
-        if missing:
-            previews = None if run.previews is None else Path(run.previews)
-            there = {path.stem for path in (work / "episodes").glob("*.json")}
-            begun = time.perf_counter()
-            done = record(jobs, work / "episodes", run.workers, previews)
-            recording_plan.write(missing, work / "episodes", options)
-            seconds = time.perf_counter() - begun  # the conversion is part of the time
-            n_steps = n_failed = 0
-            n_new = n_new_steps = 0
-            for job, recorded in zip(jobs, done, strict=True):
-                n_steps += recorded["stored"]
-                n_failed += len(recorded["failed_seeds"])
-                if job.name not in there:
-                    n_new += 1
-                    n_new_steps += recorded["stored"]
-            print(
-                f"{places}: {counted(len(done), 'episode')}, {counted(n_steps, 'step')};"
-                f" {counted(n_failed, 'seed')} failed, replaced by the next."
-            )
-            if n_new:
-                print(_throughput(n_new, n_new_steps, seconds, run.workers))
-        else:
-            print(f"{places}: {counted(len(jobs), 'episode')}, all there already.")
-        recording_plan.write_facts(work / "episodes")
-        recording_plan.tidy()
-        drafts = []
-        for job in jobs:
-            for ending in ("h5", "json", "writing"):
-                drafts.append(f"episodes/{job.name}.{ending}")
-        drop_plan(work, *drafts)
+    summary = f"{places}: {counted(len(jobs), 'episode')}, all there already."
+    if recording_plan.missing(options) or work.exists():
+        require_simulator()
+        with FolderLock(work, "recording"):
+            _claim(work, [job.plan for job in jobs])
+            # asked again: another process may have finished it meanwhile
+            missing = recording_plan.missing(options)
+            if missing:
+                previews = None if run.previews is None else Path(run.previews)
+                there = {path.stem for path in (work / "episodes").glob("*.json")}
+                begun = time.perf_counter()
+                done = record(jobs, work / "episodes", run.workers, previews)
+                recording_plan.write(missing, work / "episodes", options)
+                seconds = time.perf_counter() - begun  # the conversion is part of the time
+                n_steps = n_failed = 0
+                n_new = n_new_steps = 0
+                for job, recorded in zip(jobs, done, strict=True):
+                    n_steps += recorded["stored"]
+                    n_failed += len(recorded["failed_seeds"])
+                    if job.name not in there:
+                        n_new += 1
+                        n_new_steps += recorded["stored"]
+                summary = (
+                    f"{places}: {counted(len(done), 'episode')}, {counted(n_steps, 'step')};"
+                    f" {counted(n_failed, 'seed')} failed, replaced by the next."
+                )
+                if n_new:
+                    summary += f"\n{_throughput(n_new, n_new_steps, seconds, run.workers)}"
+            recording_plan.write_facts(work / "episodes")
+            recording_plan.tidy()
+            drafts = []
+            for job in jobs:
+                for ending in ("h5", "json", "writing"):
+                    drafts.append(f"episodes/{job.name}.{ending}")
+            drop_plan(work, *drafts)
+    print(summary)
     if run.coverage is not None:
+        require_simulator()
         report_coverage(run.tasks, recording_plan, Path(run.coverage), run.workers)
 
 

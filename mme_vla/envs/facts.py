@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.utils import write_atomically
+from mme_vla.utils.validation import validated
 
 if TYPE_CHECKING:
     from mme_vla.envs.subtasks import Progress
@@ -50,12 +51,15 @@ class Fact:
             "changed": self.changed,
         }
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "Fact":
-        """What `to_dict` returned."""
-        first, last = values["frames"]
-        needed = tuple(values["needed"])
-        return cls(values["name"], values["value"], (first, last), needed, values["changed"])
+
+def read_facts(values: object, file: str) -> list[Fact]:
+    """The facts in a file, of each of which it has what `to_dict` returned.
+
+    Raises:
+        UserError: they are none.
+    """
+    where = f"{file}: facts"
+    return validated(list[Fact], values, where, where, strict=True)
 
 
 @dataclass(frozen=True)

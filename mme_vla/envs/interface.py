@@ -28,7 +28,6 @@ from mme_vla.envs.observations import (
     RenderRequest,
     as_lists,
     frame_keys,
-    observation_space,
 )
 from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 from mme_vla.envs.robomme.robot.control import PlanningError
@@ -36,7 +35,7 @@ from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
 from mme_vla.envs.spaces import UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, listed, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
@@ -62,12 +61,10 @@ class EpisodeState:
     control step. Can be pickled.
 
     environment: what makes the scene, the action space and the limit, by name.
-    options: of the reset.
-    actions: all that were given to `step` since.
+    actions: all that were given to `step` since the reset.
     """
 
     environment: Mapping[str, Any]
-    options: dict[str, Any]
     actions: Sequence[Any]
 
 
@@ -94,7 +91,6 @@ class _Run:
     hold_steps: int = 0
     """Control steps for which the robot was told to hold its pose, by which the limit grows."""
     total_reward: float = 0.0
-    options: dict[str, Any] = field(default_factory=dict)
     actions: list[Any] = field(default_factory=list)
     """All since the reset."""
     subgoal_text: str = ""
@@ -153,7 +149,6 @@ class RoboMMEEnv(gymnasium.Env):
         self.render_mode = "rgb_array" if render else None
         self.action_space = self._space.space(task.stick)
         self._keys = frame_keys(self.include, render)
-        self.observation_space = observation_space(self._keys)
         self._render = render
         self._task: Task | None = task
         self._muted = True
@@ -170,17 +165,14 @@ class RoboMMEEnv(gymnasium.Env):
 
         Args:
             seed: without effect on the scene, which the environment's own seed fixes.
-            options: `{"video": False}` leaves the conditioning video out, for measuring and
-                debugging: its sub-tasks then remain to be done.
+            options: there are none.
 
         Returns:
             Observation lists (conditioning video, then the present frame) and the info of the
             present frame.
         """
         task = self.task
-        options = {"video": True} | (options or {})
-        others = sorted(options.keys() - {"video"})
-        require(not others, f"Unknown reset options {others}; there is only 'video'.")
+        require(not options, f"Unknown reset options {listed(options or ())}; there are none.")
         super().reset(seed=seed)
         # Leftovers of an episode, in the solver and in what the script added, go only with the
         # scene.
@@ -194,12 +186,11 @@ class RoboMMEEnv(gymnasium.Env):
             TaskFacts(task),
             task.progress.displayed,
             task.reset_action,
-            options=options,
         )
         # The video is the recorded one, whose texts change when its drops were noticed.
         with task.as_recorded():
             for subtask in task.progress.subtasks:
-                if subtask.video and options["video"]:
+                if subtask.video:
                     self._demonstrate(subtask)
         run.in_video = False
         task.unrecorded_steps = 1
@@ -254,7 +245,7 @@ class RoboMMEEnv(gymnasium.Env):
     def save_state(self) -> EpisodeState:
         """The state of the running episode, for `restore_state`; costs next to nothing."""
         run = self._require_run()
-        return EpisodeState(self._described(), run.options, tuple(run.actions))
+        return EpisodeState(self._described(), tuple(run.actions))
 
     def _described(self) -> dict[str, Any]:
         """What an environment must have in common with another one to continue its episodes."""
@@ -301,7 +292,7 @@ class RoboMMEEnv(gymnasium.Env):
         try:
             # The newest frame is the last action's, without one the reset's.
             self.render_request = hidden if state.actions else newest
-            observation, info = self.reset(options=state.options)
+            observation, info = self.reset()
             for number, action in enumerate(state.actions, start=1):
                 self.render_request = hidden if number < len(state.actions) else newest
                 observation, _, _, _, info = self.step(action)

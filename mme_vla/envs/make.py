@@ -105,7 +105,9 @@ def make_env(
     return RoboMMEEnv(simulated, action_space, max_steps, include, render, reward)
 
 
-def check_names(task: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
+def check_names(
+    task: str, action_space: str, difficulty: str | None = None, seed: int | None = None
+) -> None:
     """Refuse what can be refused without the simulator."""
     check_task_name(task)
     check_known("action space", action_space, ACTION_SPACES)

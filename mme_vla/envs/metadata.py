@@ -2,22 +2,16 @@
 
 The shipped tables are the benchmark's own. A seed follows from task, split and episode by a
 formula, except where the official demonstrator failed on it and the seed was raised until it
-succeeded (see benchmarks/episode_seeds.py). The official files are preferred: the installed package
-`robomme`, or the folder with `train/`, `val/` and `test/` that `MME_VLA_ROBOMME_METADATA` names.
+succeeded (see benchmarks/episode_seeds.py).
 """
 
 import csv
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import BaseModel, Field
+from typing import Any
 
 from mme_vla.envs.rows import (
     DIFFICULTIES,
@@ -30,8 +24,6 @@ from mme_vla.envs.rows import (
 )
 from mme_vla.errors import UserError, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
-from mme_vla.utils import read_json
-from mme_vla.utils.validation import validated
 
 TASK_NAMES = (
     "PickXtimes", "StopCube", "SwingXtimes", "BinFill",
@@ -117,12 +109,17 @@ class Variant:
             " none.",
         )
         if self.dial:
-            dials = [dial for dial, tasks in DIALS.items() if task in tasks]
+            dials = dials_of(task)
             require(
                 self.dial in dials,
                 f"{task} has no dial {self.dial!r}; it has {', '.join(dials) or 'none'}."
                 f" {self.dial} is for {', '.join(DIALS[self.dial])}.",
             )
+
+
+def dials_of(task: str) -> list[str]:
+    """The dials of a task."""
+    return [dial for dial, tasks in DIALS.items() if task in tasks]
 
 
 def read_variant(split: str) -> Variant | None:
@@ -173,13 +170,11 @@ RESERVED = "reserved"
 """Episodes for one final test of what was chosen on others; no split of the benchmark."""
 _COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS, RESERVED: 100}
 KNOWN = (*_COUNTS, HARD, CHALLENGE, OOD)
-FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _TEST_SEED = (500_000, 10_000)
 _FIRST_SEED = {
     "train": (0, 1000), "val": (1_000_000, 10_000), "test": _TEST_SEED, MORE: (2_000_000, 100_000),
     RESERVED: (5_000_000, 10_000), **dict.fromkeys(FURTHER_SPLITS, _TEST_SEED),
 }  # fmt: skip
-_Number = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 
 
@@ -278,27 +273,7 @@ def episodes(task: str, split: str = "test") -> list[EpisodeSpec]:
         return [
             EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])
         ]
-    official = _official_file(task, split)
-    if official is not None:
-        return read_official(official, task, split)
     return list(_table(split)[task])
-
-
-def _official_file(task: str, split: str) -> Path | None:
-    """The file that describes a task's episodes in the official layout: in the folder that
-    `MME_VLA_ROBOMME_METADATA` names, else in the installed official package; None without both.
-    """
-    name = Path(split, file_name(task))
-    folder = os.environ.get(FOLDER_VARIABLE)
-    if folder:
-        return Path(folder) / name
-    package = find_spec("robomme")
-    if package is not None:
-        for place in package.submodule_search_locations or ():
-            installed = Path(place, "env_metadata") / name
-            if installed.is_file():
-                return installed
-    return None
 
 
 def check_split(split: str) -> Variant | None:
@@ -354,38 +329,3 @@ def _table(split: str) -> dict[str, list[EpisodeSpec]]:
             )
         )
     return table
-
-
-def file_name(task: str) -> str:
-    """Name of the file that describes a task's episodes in the official layout."""
-    return f"record_dataset_{task}_metadata.json"
-
-
-class _OfficialEpisode(BaseModel):
-    """What is read of an episode in an official metadata file."""
-
-    episode: _Number
-    seed: _Number
-    difficulty: Literal["easy", "medium", "hard"]
-
-
-class _OfficialFile(BaseModel):
-    """What is read of an official metadata file."""
-
-    records: Annotated[list[_OfficialEpisode], Field(min_length=1)]
-
-
-def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
-    """The episodes that an official metadata file describes, in order."""
-    content = read_json(path, f"official metadata of {task}, split {split!r}")
-    try:
-        records = validated(_OfficialFile, content, "The file").records
-    except UserError as error:
-        raise UserError(f"{path} is not official metadata: {error} Get the file again.") from None
-    specs = []
-    for record in records:
-        specs.append(EpisodeSpec(task, split, record.episode, record.seed, record.difficulty))
-    specs.sort(key=lambda spec: spec.episode)
-    is_complete = [spec.episode for spec in specs] == list(range(len(specs)))
-    require(is_complete, f"{path} does not number its episodes 0, 1, 2, …; get the file again.")
-    return specs

@@ -16,7 +16,6 @@ from mme_vla.envs.rendering import links_culled
 from mme_vla.errors import require
 
 if TYPE_CHECKING:
-    import gymnasium
     from torch import Tensor
 
     from mme_vla.envs.task import Task
@@ -268,25 +267,3 @@ def frame_keys(include: Include, render: bool) -> list[str]:
     if include.maniskill_obs:
         keys.append("maniskill_obs")
     return keys
-
-
-def observation_space(keys: Sequence[str]) -> "gymnasium.spaces.Dict":
-    """Lists of frames, as Gymnasium describes them; the raw simulator observation is left out."""
-    import gymnasium
-
-    image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
-    depth = gymnasium.spaces.Box(-(2**15), 2**15 - 1, (SIDE, SIDE, 1), np.int16)
-    boxes: dict[str, gymnasium.Space] = {
-        "rgb": image,
-        "depth": depth,
-        "extrinsic": gymnasium.spaces.Box(-np.inf, np.inf, (3, 4), np.float32),
-        "joint_state": gymnasium.spaces.Box(-np.inf, np.inf, (ARM_JOINTS,), np.float32),
-        "eef_state": gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float64),
-        "gripper_state": gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64),
-    }
-    spaces: dict[str, gymnasium.Space] = {}
-    for key in keys:
-        kind = key.rsplit("_", 1)[-1]
-        if key in boxes or kind in boxes:
-            spaces[list_key(key)] = gymnasium.spaces.Sequence(boxes.get(key) or boxes[kind])
-    return gymnasium.spaces.Dict(spaces)

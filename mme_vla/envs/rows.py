@@ -51,18 +51,20 @@ def rows_of(task: str, split: str, known: tuple[str, ...]) -> list[Row]:
     match = _TIER.fullmatch(split)
     if match is None:
         path = Path(split).expanduser()
-        if not path.is_file():
-            raise UserError(
-                f"split={split}: there is no such file. Name a JSONL file of scenes, one object a"
-                " line."
-            )
+        require(
+            path.is_file(),
+            f"split={split}: there is no such file. Name a JSONL file of scenes, one object a"
+            " line.",
+        )
         return list(_read_file(str(path), path.stat().st_mtime_ns, known).get(task, []))
     tier = match[1]
     rows = _ood().get(task, [])
     if tier is None:
         return list(rows)
-    if tier not in TIERS:
-        raise UserError(f"split={split!r}: there is no tier {tier!r}. {did_you_mean(tier, TIERS)}")
+    require(
+        tier in TIERS,
+        f"split={split!r}: there is no tier {tier!r}. {did_you_mean(tier, TIERS)}",
+    )
     return [row for row in rows if row["tier"] == tier]
 
 
@@ -123,33 +125,29 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
                 f"{where}: spec.{part} is {brief(values)}; the parts are {', '.join(_PARTS)}."
             )
     seed = row["seed"]
-    if type(seed) is not int or not 0 <= seed < 2**31:
-        raise UserError(f"{where}: seed is {brief(seed)}; expected a whole number from 0.")
+    is_seed = type(seed) is int and 0 <= seed < 2**31
+    require(is_seed, f"{where}: seed is {brief(seed)}; expected a whole number from 0.")
     for name, allowed in _OPTIONAL.items():
-        if name in row and row[name] not in allowed:
-            raise UserError(
-                f"{where}: {name} is {brief(row[name])}; expected one of"
-                f" {', '.join(map(str, allowed))}."
-            )
-    if not isinstance(row.get("tier", ""), str):
-        raise UserError(
-            f"{where}: tier is {brief(row['tier'])}; expected a name, such as {TIERS[0]}."
+        choice = row.get(name, allowed[0])
+        require(
+            choice in allowed,
+            f"{where}: {name} is {brief(choice)}; expected one of {', '.join(map(str, allowed))}.",
         )
+    tier = row.get("tier", "")
+    require(
+        isinstance(tier, str),
+        f"{where}: tier is {brief(tier)}; expected a name, such as {TIERS[0]}.",
+    )
     return row | {"where": where}
 
 
-class SceneOptions(TypedDict, total=False):
-    """Keyword arguments of `make_env` that choose a scene."""
+class TaskOptions(TypedDict, total=False):
+    """Keyword arguments of a task that make a scene (`envs/task.py`)."""
 
     seed: int
     difficulty: str | None
     recovery: str | None
     row: Mapping[str, Any]
-
-
-class TaskOptions(SceneOptions, total=False):
-    """Keyword arguments of a task that make a scene (`envs/task.py`)."""
-
     in_view: bool
     stress: Mapping[str, int]
 

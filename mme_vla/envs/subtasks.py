@@ -7,8 +7,9 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.embodiment.action_space import Option
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import brief, require
 from mme_vla.registry import REWARDS
+from mme_vla.utils.validation import validated
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
@@ -221,13 +222,15 @@ class ProcessScore:
     @classmethod
     def from_dict(cls, value: Any) -> "ProcessScore":
         """Read what `to_dict` made."""
-        unknown = f"process={brief(value)} of a record is no process score."
-        try:
-            score = cls(**value)
-        except TypeError:
-            raise UserError(unknown) from None
-        require(score.operation in (MOTION, "", *OPERATIONS), unknown)
-        require(score.broke in (*BROKEN, ""), unknown)
+        where = "record.process"
+        score = validated(cls, value, where, where, strict=True)
+        kinds = {"broke": BROKEN, "operation": (MOTION, *OPERATIONS)}
+        for name, known in kinds.items():
+            word = getattr(score, name)
+            require(
+                word in ("", *known),
+                f"{where}.{name}={brief(word)} must be empty or one of {', '.join(known)}.",
+            )
         return score
 
 

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import torch
 
 from mme_vla.envs.facts import Candidates, VisibleFact
+from mme_vla.envs.metadata import dials_of
 from mme_vla.envs.robomme.scene.motions import Cue, Motion, build_cue, show_cue
 from mme_vla.envs.robomme.scene.objects import Disc
 from mme_vla.envs.robomme.scene.placement import Draws
@@ -65,9 +66,6 @@ class Task(Stage):
     """The failed pick is sampled in every initialisation (there are two), not once
     after the scene.
     """
-
-    dials: ClassVar[frozenset[str]] = frozenset()
-    """Dials of `metadata.DIALS` that the task has."""
     fact_choices: ClassVar[str | None] = None
     """Letters of the options whose ends show what is to be remembered; None: all of them."""
 
@@ -98,11 +96,12 @@ class Task(Stage):
             check_known("recovery mode", recovery, RECOVERY_MODES)
         self.stress: dict[str, int] = {}
         """Dials that are turned, and how far."""
+        dials = dials_of(type(self).__name__)
         for dial, turned in (stress or {}).items():
             require(
-                dial in self.dials and turned >= 0,
+                dial in dials and turned >= 0,
                 f"{type(self).__name__} cannot turn {dial!r} by {turned}: its dials are"
-                f" {', '.join(sorted(self.dials)) or 'none'}, and turn up only.",
+                f" {', '.join(dials) or 'none'}, and turn up only.",
             )
             if turned:
                 self.stress[dial] = turned
@@ -205,7 +204,7 @@ class Task(Stage):
         return VisibleFact(str(count), {f"count of {subtasks[i].choice}"}, replaces=True)
 
     def flip_fact(self) -> dict[str, Any] | None:
-        """The values (`values.spec`) of a scene that differs from this one in a single fact: the
+        """The values (`values.changed`) of a scene that differs from this one in a single fact: the
         goal, every place and what is to be done look the same once the fact has been shown.
 
         By default None: what the robot itself did, such as a count, is no value of a scene.

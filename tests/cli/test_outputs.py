@@ -11,7 +11,8 @@ import pytest
 from mme_vla.cli import docs, gallery, results, train_tokenizer
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.config.composition import compose
-from mme_vla.errors import UserError
+from mme_vla.envs import metadata
+from mme_vla.errors import SceneError, UserError
 from mme_vla.extras.nano.cli import board
 from mme_vla.extras.nano.fitting import _remove_drafts
 from mme_vla.extras.probing.cli.analyse import _beside, _save
@@ -164,6 +165,21 @@ def test_a_tokenizer_of_a_checkpoint_is_not_replaced(
     for _ in range(2):
         train_tokenizer.main([str(tmp_path / "new")])
     assert (tmp_path / "new" / "tokenizer.model").read_bytes() == b"trained"
+
+
+@pytest.mark.parametrize(
+    ("split", "seeds"), [("test", r"seeds 520000 … 520099\."), ("ood", r"\(seed 16200000\)\.")]
+)
+def test_a_gallery_names_the_seeds_it_has_tried(
+    monkeypatch: pytest.MonkeyPatch, split: str, seeds: str
+) -> None:
+    def fail(task: str, **options: object) -> None:
+        raise SceneError("no place")
+
+    monkeypatch.setattr(gallery, "make_task", fail)
+    spec = metadata.episode("StopCube", split, 0)
+    with pytest.raises(UserError, match=f"StopCube episode 0: no demonstration .* {seeds}"):
+        gallery.demonstrated(spec)
 
 
 def test_a_gallery_replaces_no_readme_but_its_own(

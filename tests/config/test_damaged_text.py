@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from helpers import artefacts
-from mme_vla.envs import metadata
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import RECORDS, read_records, read_run
 from mme_vla.processing.normalise import QuantileStats, check_reach
@@ -56,19 +55,6 @@ def test_a_damaged_reply_is_requested_again(tmp_path: Path, damage: str, caplog)
     cached.unlink()
     cached.mkdir()
     assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
-
-
-@pytest.mark.parametrize(
-    "record", ['"x"', '{"episode": 0}', '{"episode": 0, "seed": 1e3, "difficulty": "easy"}']
-)
-def test_metadata_of_another_form_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: str
-) -> None:
-    monkeypatch.setenv(metadata.FOLDER_VARIABLE, str(tmp_path))
-    artefacts.write_metadata(tmp_path)
-    next(tmp_path.rglob("*.json")).write_text(f'{{"records": [{record}]}}')
-    with pytest.raises(UserError, match="not official metadata"):
-        metadata.episodes("PickXtimes", "test")
 
 
 def test_states_well_beyond_the_statistics_are_a_broken_driver() -> None:

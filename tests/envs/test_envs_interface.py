@@ -51,6 +51,13 @@ def test_the_stick_s_video_leaves_out_what_is_not_recorded(make_unrendered) -> N
 # The contract -------------------------------------------------------------------------------------
 
 
+def test_a_reset_takes_no_options(make_unrendered) -> None:
+    env = make_unrendered("StopCube")
+    env.reset(seed=3, options={})
+    with pytest.raises(UserError, match="Unknown reset options video; there are none"):
+        env.reset(options={"video": False})
+
+
 def test_a_step_gives_lists_of_one_frame_and_the_official_info(make_unrendered) -> None:
     include = Include(front_camera_extrinsic=True, front_camera_intrinsic=True)
     env = make_unrendered(include=include)

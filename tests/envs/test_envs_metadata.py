@@ -12,12 +12,6 @@ from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec, episode, episodes, fo
 from mme_vla.errors import UserError
 
 
-@pytest.fixture(autouse=True)
-def _shipped_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(metadata.FOLDER_VARIABLE, raising=False)
-    monkeypatch.setattr(metadata, "find_spec", lambda name: None)
-
-
 @pytest.mark.parametrize(("split", "count"), [("train", 1600), ("val", 800), ("test", 800)])
 def test_every_split_has_its_number_of_episodes(split: str, count: int) -> None:
     table = [spec for task in TASK_NAMES for spec in episodes(task, split)]
@@ -92,31 +86,19 @@ def test_official_episodes_match_the_table(h5_folder: Path) -> None:
     assert compared > 0
 
 
-def test_official_metadata_overrules_the_table(
+def test_neither_a_package_nor_a_variable_changes_a_split(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "test"
-    folder.mkdir()
-    records = [{"task": "StopCube", "episode": 0, "seed": 520_003, "difficulty": "hard"}]
-    content = {"env_id": "StopCube", "record_count": 1, "records": records}
-    (folder / "record_dataset_StopCube_metadata.json").write_text(json.dumps(content))
-    monkeypatch.setenv(metadata.FOLDER_VARIABLE, str(tmp_path))
-    spec = episode("StopCube", "test", 0)
-    assert (spec.seed, spec.difficulty) == (520_003, "hard")
-    with pytest.raises(UserError, match="expected 0 to 0"):
-        episode("StopCube", "test", 1)
-    with pytest.raises(UserError, match="does not exist"):
-        episode("BinFill", "test", 0)
-
-
-def test_a_broken_official_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(metadata.FOLDER_VARIABLE, str(tmp_path))
-    (tmp_path / "test").mkdir()
-    (tmp_path / "test" / "record_dataset_StopCube_metadata.json").write_text(
-        '{"records": [{"episode": 0}]}'
-    )
-    with pytest.raises(UserError, match="not official metadata"):
-        episodes("StopCube", "test")
+    record = {"task": "StopCube", "episode": 0, "seed": 520_003, "difficulty": "hard"}
+    folder = tmp_path / "robomme" / "env_metadata" / "test"
+    folder.mkdir(parents=True)
+    (tmp_path / "robomme" / "__init__.py").touch()
+    file = folder / "record_dataset_StopCube_metadata.json"
+    file.write_text(json.dumps({"records": [record]}))
+    expected = episodes("StopCube", "test")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MME_VLA_ROBOMME_METADATA", str(folder.parent))
+    assert episodes("StopCube", "test") == expected
 
 
 @pytest.mark.parametrize(

@@ -273,27 +273,19 @@ def test_unknown_names_are_refused_before_any_process_starts(
         make_vec_env(**arguments)
 
 
-def test_the_choice_of_a_scene_reaches_the_environments(monkeypatch: pytest.MonkeyPatch) -> None:
-    factories: list[Any] = []
-    monkeypatch.setattr("mme_vla.envs.make.require_simulator", lambda: None)
-    monkeypatch.setattr(pool, "VecEnv", lambda jobs, workers, make, timeout: factories.append(make))
-    make_vec_env("StopCube", [0], seed=3, difficulty="easy", recovery="z")
-    row = {"task": "StopCube", "spec": {}}
-    make_vec_env("StopCube", [0], row=row)
-    by_seed, by_row = factories
-    assert {"seed": 3, "difficulty": "easy", "recovery": "z"}.items() <= by_seed.keywords.items()
-    assert by_row.keywords["row"] is row
-    with pytest.raises(UserError, match="A difficulty needs a seed"):
-        make_vec_env("StopCube", [0], difficulty="easy")
+def test_its_episodes_are_those_of_the_split() -> None:
+    for scene in ({"seed": 3}, {"row": {"task": "StopCube", "spec": {}}}, {"recovery": "z"}):
+        with pytest.raises(TypeError, match="unexpected keyword argument"):
+            make_vec_env("StopCube", [0], **scene)  # type: ignore[arg-type]
 
 
-def test_an_environment_of_ones_own_has_no_options_of_robommes_scenes(
+def test_an_environment_of_ones_own_takes_no_reward(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(pool, "environment", lambda name: Environment)
     monkeypatch.setattr(Environment, "check_installed", lambda: None)
-    with pytest.raises(UserError, match=r"env=own takes no reward, .*recovery.*: they are for"):
-        make_vec_env("Own", [0], env="own", recovery="z")
+    with pytest.raises(UserError, match="env=own takes no reward and no include: they are for"):
+        make_vec_env("Own", [0], env="own", reward="sparse")
 
 
 def test_real_environments_run_in_workers() -> None:

@@ -45,7 +45,7 @@ def test_the_video_ends_with_the_swaps_one_after_another(build_task):
     ]
     env.progress.index = 3
     wait(env)  # the swaps begin in the step after the one in which the stage was seen
-    for initiator in env.initiators:
+    for initiator, _ in env.swapped:
         start = {cube: cube.position for cube in env.cubes}
         remaining = [cube for cube in env.cubes if cube is not initiator]
         partner, third = sorted(

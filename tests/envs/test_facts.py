@@ -16,8 +16,9 @@ from mme_vla import Fact
 from mme_vla.config.plugins import import_plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes
-from mme_vla.envs.facts import COLUMNS, FactLog, VisibleFact, write_facts
+from mme_vla.envs.facts import COLUMNS, FactLog, VisibleFact, read_facts, write_facts
 from mme_vla.envs.metadata import TASK_NAMES
+from mme_vla.errors import UserError
 from mme_vla.extras.probing.evidence import EvidenceEpisode
 
 RED = {"cover 0": VisibleFact("red: container_1", {"container_1"})}
@@ -66,7 +67,7 @@ def test_a_fact_is_needed_at_the_decisions_from_its_first_frame_on() -> None:
 
 def test_facts_survive_plain_values_and_make_a_table(tmp_path: Path) -> None:
     facts = [Fact("cover 0", "red: a, blue: b", (0, 31), (114, 200), 64), Fact("b", "1", (3, 3))]
-    assert [Fact.from_dict(fact.to_dict()) for fact in facts] == facts
+    assert read_facts([fact.to_dict() for fact in facts], "a.json") == facts
     write_facts(tmp_path / "meta" / "facts.csv", [(0, "VideoUnmask", facts), (1, "Other", [])])
     with (tmp_path / "meta" / "facts.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
@@ -75,6 +76,22 @@ def test_facts_survive_plain_values_and_make_a_table(tmp_path: Path) -> None:
         ["0", "VideoUnmask", "cover 0", "red: a, blue: b", "0", "31", "114 200", "64"],
         ["0", "VideoUnmask", "b", "1", "3", "3", "", ""],
     ]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": [1]}, r"a.json: facts\[0\].frames=\[1\] must be a list of 2 values"),
+        ({"value": 3}, r"a.json: facts\[0\].value=3 must be a text"),
+        ({"shown": 3}, r"Unknown key a.json: facts\[0\].shown"),
+    ],
+)
+def test_damaged_facts_are_refused(change: dict[str, object], message: str) -> None:
+    values = Fact("b", "1", (3, 3)).to_dict()
+    with pytest.raises(UserError, match=message):
+        read_facts([values | change], "a.json")
+    with pytest.raises(UserError, match=r"a.json: facts\[0\] lacks the key 'name'"):
+        read_facts([{"value": "1"}], "a.json")
 
 
 def test_an_environment_of_ones_own_names_its_facts(monkeypatch: pytest.MonkeyPatch) -> None:

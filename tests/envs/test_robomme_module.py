@@ -79,6 +79,24 @@ def test_episodes_of_the_user_come_from_a_folder(wrapper: ModuleType, tmp_path: 
     assert builder.resolve_episode(1) == (901, "hard")
 
 
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        ('"x"', "is not official metadata"),
+        ('{"episode": 0}', "is not official metadata"),
+        ('{"episode": 0, "seed": 1e3, "difficulty": "easy"}', "is not official metadata"),
+        ('{"episode": 1, "seed": 1, "difficulty": "easy"}', "does not number its episodes"),
+    ],
+)
+def test_metadata_of_another_form_is_refused(
+    wrapper: ModuleType, tmp_path: Path, record: str, message: str
+) -> None:
+    file = tmp_path / "record_dataset_StopCube_metadata.json"
+    file.write_text(f'{{"records": [{record}]}}')
+    with pytest.raises(UserError, match=message):
+        wrapper.BenchmarkEnvBuilder("StopCube", override_metadata_path=tmp_path)
+
+
 def test_its_environment_is_make_envs(wrapper: ModuleType) -> None:
     importlib.import_module("robomme.robomme_env")
     builder = wrapper.BenchmarkEnvBuilder("StopCube", dataset="val", max_steps=5)

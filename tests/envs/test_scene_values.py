@@ -181,7 +181,11 @@ BAD = [
     ("PickXtimes", put("objects.num_repeats", 2.5), "objects.num_repeats"),
     ("PickXtimes", put("objects.target_color", "purple"), "objects.target_color"),
     ("PickXtimes", put("layout.cubes", {"mauve_0": [0, 0, 0]}), "layout.cubes.mauve_0"),
-    ("PickXtimes", put("layout.goal_xy", [float("nan"), 0]), "layout.goal_xy"),
+    (
+        "PickXtimes",
+        put("layout.goal_xy", [float("nan"), 0]),
+        r"layout.goal_xy\[0\]=nan must be a number from -2.0 to 2.0",
+    ),
     (
         "SwingXtimes",
         put("layout.distractors", {"pink_0": [0.1, 0.1, 0]}),

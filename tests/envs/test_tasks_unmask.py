@@ -83,7 +83,7 @@ def test_the_video_lasts_until_the_last_motion_has_ended(build_task):
 def test_two_containers_change_places_at_a_time_and_the_others_stand_still(build_task):
     env = build_task(VideoUnmaskSwap, 5300, "hard")
     wait(env, 65)
-    for initiator in env.initiators:
+    for initiator, _ in env.swapped:
         start = {container: container.pose for container in env.containers}
         others = [c for c in env.containers if c is not initiator]
         nearest = min(others, key=lambda c: distance_xy(c.position, initiator.position))

@@ -129,5 +129,19 @@ def test_records_tables_and_the_report_tell_it() -> None:
     )
     assert row["where"] == "–" and row["success"] == "1"
     assert "where the chain broke" in html_report(results, [], "t")
-    with pytest.raises(UserError, match="no process score"):
-        ProcessScore.from_dict({"done": 1, "of": 2, "broke": "torn"})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"broke": "torn"}, "record.process.broke='torn' must be empty or one of wrong, stuck"),
+        ({"operation": "when"}, "record.process.operation='when' must be empty or one of motion"),
+        ({"done": "1"}, "record.process.done='1' must be a whole number"),
+        ({"ended": 3}, "Unknown key record.process.ended"),
+    ],
+)
+def test_a_damaged_process_score_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        ProcessScore.from_dict({"done": 1, "of": 2, **change})
+    with pytest.raises(UserError, match="lacks the key 'of'"):
+        ProcessScore.from_dict({"done": 1})

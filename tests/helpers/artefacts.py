@@ -187,14 +187,3 @@ def read_rows(folder: Path) -> object:
             array for clip in question.videos for array in (clip.frames, clip.indices, clip.length)
         ]
     return digest(*read)
-
-
-def write_metadata(folder: Path) -> None:
-    """Official metadata of one task."""
-    records = [
-        {"task": "PickXtimes", "episode": e, "seed": 500 + e, "difficulty": "easy"}
-        for e in range(4)
-    ]
-    place = folder / "test" / "record_dataset_PickXtimes_metadata.json"
-    place.parent.mkdir()
-    place.write_text(json.dumps({"env_id": "PickXtimes", "record_count": 4, "records": records}))

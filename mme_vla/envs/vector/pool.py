@@ -23,15 +23,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import wait
-from typing import Any, Unpack
+from typing import Any
 
 from mme_vla.envs.base import environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_names, make_env
 from mme_vla.envs.observations import Include, RenderRequest
-from mme_vla.envs.rows import SceneOptions
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import SceneError, UserError, listed, require, text_of
+from mme_vla.errors import SceneError, UserError, require, text_of
 from mme_vla.utils.processes import check_main_guard, signals_deferred
 
 
@@ -369,7 +368,6 @@ def make_vec_env(
     include: Include | None = None,
     timeout: float = 600.0,
     env: str = ROBOMME,
-    **scene: Unpack[SceneOptions],
 ) -> VecEnv:
     """Environments for all given episodes of all given tasks.
 
@@ -382,7 +380,6 @@ def make_vec_env(
             RoboMME alone.
         timeout: seconds after which a command without result counts as hung.
         env: the environment whose tasks these are.
-        scene: `seed`, `difficulty`, `recovery` and `row` of `make_env`, for RoboMME alone.
     """
     names = [tasks] if isinstance(tasks, str) else list(tasks)
     require(names, "No task given; expected a task name or several.")
@@ -390,15 +387,14 @@ def make_vec_env(
     source.check_installed()
     # A process would end with a traceback.
     require(
-        env == ROBOMME or (reward == "none" and include is None and not scene),
-        f"env={env} takes no reward, include, {listed(SceneOptions.__annotations__)}: they are for"
-        f" env={ROBOMME}.",
+        env == ROBOMME or (reward == "none" and include is None),
+        f"env={env} takes no reward and no include: they are for env={ROBOMME}.",
     )
     selection = None if episodes is None else list(episodes)
     jobs = []
     for name in names:
         if env == ROBOMME:
-            check_names(name, action_space, scene.get("difficulty"), scene.get("seed"))
+            check_names(name, action_space)
         numbers = selection
         if numbers is None:
             numbers = list(range(len(source.episodes(name, split))))
@@ -411,5 +407,5 @@ def make_vec_env(
     }
     make = partial(open_episode, env, **shared)
     if env == ROBOMME:
-        make = partial(make_env, **shared, reward=reward, include=include, **scene)
+        make = partial(make_env, **shared, reward=reward, include=include)
     return VecEnv(jobs, workers, make, timeout)

@@ -16,7 +16,7 @@ import numpy as np
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_state
-from mme_vla.envs.facts import Fact
+from mme_vla.envs.facts import Fact, read_facts
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import RenderRequest, capture, read_images
 from mme_vla.envs.robomme.recording.frames import FrameChoice, choices_of, motions_of
@@ -122,7 +122,7 @@ def _about(path: Path, file: Any) -> dict[str, Any]:
         f"{path} is of an earlier version: remove it and record it again.",
     )
     if "facts" in about:
-        about["facts"] = [Fact.from_dict(fact) for fact in about["facts"]]
+        about["facts"] = read_facts(about["facts"], str(path))
     return about
 
 

@@ -13,7 +13,7 @@ from mme_vla.data.convert import ConvertOptions, convert, drop_work, planned_opt
 from mme_vla.data.hdf5 import EpisodeRef, list_episodes, open_episode
 from mme_vla.data.lerobot_files import FACTS, SIDE_FILE
 from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.envs.facts import Fact, write_facts
+from mme_vla.envs.facts import read_facts, write_facts
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.errors import require
@@ -209,8 +209,9 @@ class RecordingPlan:
             return
         facts = {}
         for job in self.jobs:
-            known = read_json(episodes / f"{job.name}.json", "what is known of a recorded episode")
-            facts[job.name] = [Fact.from_dict(fact) for fact in known["facts"]]
+            file = episodes / f"{job.name}.json"
+            known = read_json(file, "what is known of a recorded episode")
+            facts[job.name] = read_facts(known.get("facts"), str(file))
         for place in self.places:
             if place == self.dataset:
                 table = place / FACTS

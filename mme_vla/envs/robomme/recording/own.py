@@ -14,7 +14,7 @@ from mme_vla.data.lerobot_files import FACTS, SIDE_FILE
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import choice_action
 from mme_vla.envs.base import CHOICES, OPTIONS, Environment, EpisodeEnv
-from mme_vla.envs.facts import Fact, write_facts
+from mme_vla.envs.facts import Fact, read_facts, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import UserError, counted
@@ -79,7 +79,7 @@ def record_own(
             task = episodes[path].task
             # Of every episode, also of one without options: a reader counts them.
             records.append({"episode_index": len(tables), "task": task, "options": options})
-            tables.append((len(tables), task, [Fact.from_dict(fact) for fact in facts]))
+            tables.append((len(tables), task, read_facts(facts, str(path))))
             length = len(columns[STATE])
             for frame in range(length):
                 row = {name: column[frame] for name, column in columns.items()}

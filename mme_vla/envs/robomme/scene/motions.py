@@ -181,15 +181,19 @@ class Swap:
         return VisibleFact(" and ".join(names), frozenset(names), replaces=True)
 
 
-def sequential_swaps(
-    initiators: Sequence[Thing], group: Sequence[Thing], start: int, steps: int = SWAP_STEPS
+def swaps_in_turn(
+    pairs: Sequence[tuple[Thing, Thing | None]],
+    group: Sequence[Thing],
+    start: int,
+    steps: int = SWAP_STEPS,
 ) -> list[Swap]:
-    """One swap after another, the first at step `start`; the partner is the nearest object when a
-    swap begins.
+    """One swap after another, the first at step `start`.
+
+    pairs: of each swap its initiator and its partner, as `Swap` takes them.
     """
     swaps = []
-    for thing in initiators:
-        swaps.append(Swap(thing, group, start, steps=steps))
+    for initiator, partner in pairs:
+        swaps.append(Swap(initiator, group, start, partner=partner, steps=steps))
         start += steps
     return swaps
 
@@ -198,19 +202,6 @@ def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
     """Linear mixture of two quaternions, normalised."""
     mixed = (1 - alpha) * np.asarray(a) + alpha * np.asarray(b)
     return mixed / norm(mixed)
-
-
-def planned_swaps(
-    pairs: Sequence[Sequence[int]], group: Sequence[Thing], start: int, steps: int = SWAP_STEPS
-) -> list[Swap]:
-    """One swap after another, the first at step `start`; both objects of each are given by their
-    indices.
-    """
-    swaps = []
-    for a, b in pairs:
-        swaps.append(Swap(group[a], group, start, partner=group[b], steps=steps))
-        start += steps
-    return swaps
 
 
 def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> dict[str, VisibleFact]:

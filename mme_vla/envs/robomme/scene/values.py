@@ -10,17 +10,25 @@ Units: `[x, y]` is a centre in metres. `[x, y, yaw]` of a cube has radians, of a
 
 import copy
 import itertools
-import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Interval, Len
+from pydantic import FiniteFloat
 
 from mme_vla.envs.robomme.scene.placement import Box2D
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import brief, require
+from mme_vla.utils.validation import validated
 
 BOUND = 2.0
 """Largest coordinate of a place in a row, metres: the table ends before it."""
+Coordinate = Annotated[float, Interval(ge=-BOUND, le=BOUND)]
+_Share = Annotated[float, Interval(ge=0, le=1)]
+_PLACES: dict[int, Any] = {
+    2: tuple[Coordinate, Coordinate],
+    3: tuple[Coordinate, Coordinate, FiniteFloat],
+}
 OVERLAP = 0.005
 """How far two objects of a row may reach into each other, metres: turned cubes of the benchmark may
 touch.
@@ -42,134 +50,89 @@ class Values:
         self._where = where
         self._occupied: list[tuple[str, Box2D]] = []
 
-    def __call__[T](self, name: str, sample: Callable[[], T], default: T | None = None) -> T:
+    def __call__(
+        self, name: str, sample: Callable[[], Any], kind: Any = Any, default: Any = None
+    ) -> Any:
         """One value: read from the row, or sampled and noted.
 
         Args:
             name: path of the value.
             sample: makes it from random numbers; must give plain numbers, texts, lists or arrays.
+            kind: the type that it is checked against.
             default: where the row lacks the value; None requires it.
 
         Raises:
-            UserError: the row lacks the value, or it is not of the kind that sampling gives.
+            UserError: the row lacks the value, or it is not of this kind.
         """
         if not self.specified:
-            value = sample()
-            self.note(name, value)
-            return value
+            self.note(name, sample())
+        value = self.read(name, kind)
+        if value is None:
+            value = default
+        self.require(value is not None, name, "is missing")
+        return value
+
+    def read(self, name: str, kind: Any) -> Any:
+        """A value of the row, checked against a type; None where the row has none."""
         value = self.find(name)
         if value is None:
-            if default is None:
-                raise self.error(name, "is missing")
-            return default
-        return value
+            return None
+        where = f"{self._where}: spec.{name}"
+        return validated(kind, value, where, where, strict=True)
 
-    def place(self, name: str, sample: Callable[[], Any], size: int = 2) -> list[float]:
+    def place(
+        self, name: str, sample: Callable[[], Any], size: Literal[2, 3] = 2
+    ) -> tuple[float, ...]:
         """`size` numbers, the first two of which are a place on the table."""
-        value = self(name, lambda: [float(v) for v in sample()])
-        if self.specified:
-            return self.check_place(name, value, size)
-        return value
-
-    def check_place(self, name: str, value: Any, size: int) -> list[float]:
-        """A place that a row gives, if it is one."""
-        is_list = isinstance(value, list) and len(value) == size
-        if (
-            not is_list
-            or not all(_is_number(v) for v in value)
-            or max(abs(value[0]), abs(value[1])) > BOUND
-        ):
-            raise self.error(
-                name, f"is {brief(value)}; expected {size} numbers, x and y within {BOUND} m"
-            )
-        return [float(v) for v in value]
+        return self(name, sample, _PLACES[size])
 
     def integer(self, name: str, sample: Callable[[], int], least: int = 0, most: int | None = None,
                 default: int | None = None) -> int:  # fmt: skip
         """A whole number from `least` to `most`, both included."""
-        value = self(name, sample, default)
-        if self.specified:
-            limit = f"at least {least}" if most is None else f"{least} to {most}"
-            too_large = type(value) is int and most is not None and value > most
-            if type(value) is not int or value < least or too_large:
-                raise self.error(name, f"is {brief(value)}; expected a whole number, {limit}")
-        return value
+        return self(name, sample, Annotated[int, Interval(ge=least, le=most)], default)
 
     def number(self, name: str, sample: Callable[[], float]) -> float:
         """A finite number."""
-        value = self(name, sample)
-        if not _is_number(value):
-            raise self.error(name, f"is {brief(value)}; expected a number")
-        return float(value)
+        return self(name, sample, FiniteFloat)
 
     def flag(self, name: str, sample: Callable[[], bool], default: bool | None = None) -> bool:
         """True or false."""
-        value = self(name, sample, default)
-        if type(value) is not bool:
-            raise self.error(name, f"is {brief(value)}; expected true or false")
-        return value
+        return self(name, sample, bool, default)
 
     def indices(
         self, name: str, sample: Callable[[], list[int]], count: int, distinct: bool = True
     ) -> list[int]:
         """Indices into a list of `count` entries."""
-        value = self(name, sample)
-        if self.specified:
-            valid = isinstance(value, list) and all(
-                type(v) is int and 0 <= v < count for v in value
-            )
-            if not valid or (distinct and len(set(value)) < len(value)):
-                once = ", each once" if distinct else ""
-                raise self.error(
-                    name, f"is {brief(value)}; expected numbers from 0 to {count - 1}{once}"
-                )
-        return value
+        kind = list[Annotated[int, Interval(ge=0, le=count - 1)]]
+        indices: list[int] = self(name, sample, kind)
+        differ = len(set(indices)) == len(indices)
+        self.require(
+            differ or not distinct, name, f"is {brief(indices)}; expected each number once"
+        )
+        return indices
 
-    def pairs(self, name: str, count: int) -> list[list[int]] | None:
+    def pairs(self, name: str, count: int) -> list[tuple[int, int]] | None:
         """Pairs of different indices below `count`; None where the row has none."""
-        value = self.find(name)
-        if value is None:
-            return None
-        pairs = value if isinstance(value, list) else [value]
-        for pair in pairs:
-            are_two = isinstance(pair, list) and len(pair) == 2
-            if (
-                not are_two
-                or any(type(i) is not int or not 0 <= i < count for i in pair)
-                or pair[0] == pair[1]
-            ):
-                raise self.error(
-                    name, f"has {brief(pair)}; expected two different numbers from 0 to {count - 1}"
-                )
+        index: Any = Annotated[int, Interval(ge=0, le=count - 1)]
+        pairs = self.read(name, list[tuple[index, index]])
+        for i, (first, second) in enumerate(pairs or []):
+            self.require(
+                first != second, f"{name}[{i}]", f"is {first} twice; expected different numbers"
+            )
         return pairs
 
-    def words(
-        self, name: str, sample: Callable[[], list[str]], known: Mapping[str, Any]
-    ) -> list[str]:
+    def words(self, name: str, sample: Callable[[], list[str]], known: Iterable[str]) -> list[str]:
         """Names, each of those `known`, such as colours."""
-        value = self(name, sample)
-        words = value if isinstance(value, list) else [value]
-        for word in words:
-            self._check_word(name, word, known)
-        return words
+        return self(name, sample, list[Literal[*known]])  # type: ignore[valid-type]
 
-    def word(self, name: str, sample: Callable[[], str], known: Mapping[str, Any]) -> str:
+    def word(self, name: str, sample: Callable[[], str], known: Iterable[str]) -> str:
         """One of the names `known`."""
-        value = self(name, sample)
-        self._check_word(name, value, known)
-        return value
-
-    def _check_word(self, name: str, word: Any, known: Mapping[str, Any]) -> None:
-        if not isinstance(word, str) or word not in known:
-            raise self.error(name, f"has {brief(word)}; expected one of {', '.join(known)}")
+        return self(name, sample, Literal[*known])
 
     def colour(self, name: str, sample: Callable[[], Any]) -> tuple[float, float, float]:
         """Red, green and blue in 0 … 1; a fourth number is left out."""
-        value = self(name, sample)
-        rgb = value[:3] if isinstance(value, list) else []
-        if len(rgb) != 3 or not all(_is_number(v) and 0 <= v <= 1 for v in rgb):
-            raise self.error(name, f"is {brief(value)}; expected red, green and blue from 0 to 1")
-        return float(rgb[0]), float(rgb[1]), float(rgb[2])
+        red, green, blue, *_ = self(name, sample, Annotated[list[_Share], Len(3, 4)])
+        return red, green, blue
 
     def find(self, name: str) -> Any:
         """A value of the row, or None; `initializations` means its last entry."""
@@ -187,16 +150,16 @@ class Values:
     def names(self, name: str) -> list[str]:
         """Names of the entries of a part of the row, in order."""
         value = self.find(name)
-        if value is not None and not isinstance(value, Mapping):
-            raise self.error(name, f"is {brief(value)}; expected places by name")
-        return list(value or {})
+        if value is None:
+            return []
+        self.require(
+            isinstance(value, Mapping), name, f"is {brief(value)}; expected places by name"
+        )
+        return list(value)
 
     def count(self, name: str) -> int:
         """Entries of a list of the row; 0 where it has none."""
-        value = self.find(name)
-        if value is not None and not isinstance(value, list):
-            raise self.error(name, f"is {brief(value)}; expected a list")
-        return len(value or [])
+        return len(self.read(name, list) or [])
 
     def note(self, name: str, value: Any) -> None:
         """Keep a sampled value; an index continues a list."""
@@ -214,9 +177,18 @@ class Values:
         else:
             holder[parts[-1]] = _to_json(value)
 
-    def error(self, name: str, problem: str) -> UserError:
-        """What is wrong with a value of the row."""
-        return UserError(f"{self._where}: spec.{name} {problem}.")
+    def changed(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """A copy of all values in which these are others, by their names."""
+        copied = Values(self.spec)
+        for name, value in values.items():
+            copied.note(name, value)
+        return copied.spec
+
+    def require(self, holds: object, name: str, problem: str) -> None:
+        """Refuse the row, naming one of its values and what is wrong with it, unless something
+        holds.
+        """
+        require(holds, f"{self._where}: spec.{name} {problem}.")
 
     def occupy(self, name: str, xy: Any, half: float, yaw: float = 0.0) -> None:
         """Note that an object of a row stands there, a square; refuse one that stands in another.
@@ -231,13 +203,8 @@ class Values:
             return
         box = Box2D.square(np.asarray(xy, float)[:2], half - OVERLAP, yaw)
         for other, occupied in self._occupied:
-            if box.intersects(occupied):
-                raise self.error(name, f"overlaps spec.{other}")
+            self.require(not box.intersects(occupied), name, f"overlaps spec.{other}")
         self._occupied.append((name, box))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _to_json(value: Any) -> Any:

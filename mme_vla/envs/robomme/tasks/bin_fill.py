@@ -4,14 +4,14 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import sapien
+from pydantic import NonNegativeInt
 
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Appear, Cue, row, tally
-from mme_vla.envs.robomme.scene.objects import Cube, H, build_board, build_cube
-from mme_vla.envs.robomme.scene.placement import Draws, Region, SceneError, draw_cube
+from mme_vla.envs.robomme.scene.objects import Cube, build_board
+from mme_vla.envs.robomme.scene.placement import Draws, Region, SceneError
 from mme_vla.envs.robomme.scene.predicates import (
     ON_TARGET,
     any_picked_up,
@@ -24,6 +24,7 @@ from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
     SAMPLED_COLOURS,
     add_button,
+    add_cube,
     press,
     press_choice,
 )
@@ -66,23 +67,22 @@ class BinFill(Task):
 
         dx, y, degrees = values.place("layout.board_offsets", sample_board, size=3)
         self.board = self.add(build_board(self, (BOARD_X + dx, y), math.radians(degrees)))
-        numbers = values("objects.target_numbers", lambda: self._draw_counts(draws))
-        are_counts = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)
-        if not are_counts or len(numbers) != len(SAMPLED_COLOURS) or not any(numbers):
-            raise values.error(
-                "objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green"
-            )
+        numbers = values(
+            "objects.target_numbers", lambda: self._draw_counts(draws), list[NonNegativeInt]
+        )
+        values.require(
+            len(numbers) == len(SAMPLED_COLOURS) and any(numbers),
+            "objects.target_numbers",
+            f"is {numbers}; expected three numbers, not all 0: red, blue, green",
+        )
         self.goal = Counter(dict(zip(SAMPLED_COLOURS, numbers, strict=True)))
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in SAMPLED_COLOURS}
-        if values.specified:
-            self._read_cubes()
-        else:
-            self._draw_cubes(draws)
+        colours = self._read_colours() if values.specified else self._draw_colours(draws)
+        self._add_cubes(draws, colours)
         for colour in SAMPLED_COLOURS:
             if len(self.cubes[colour]) < self.goal[colour]:
                 problem = f"a {colour} cube for the bin"
-                if values.specified:
-                    raise values.error("objects.slot_assignment", f"lacks {problem}")
+                values.require(not values.specified, "objects.slot_assignment", f"lacks {problem}")
                 raise SceneError(f"BinFill, seed {self.seed}: {problem} finds no place.")
 
     def _draw_counts(self, draws: Draws) -> list[int]:
@@ -109,46 +109,46 @@ class BinFill(Task):
             self.spawned[available[index]] += 1
         return [goal[colour] for colour in SAMPLED_COLOURS]
 
-    def _draw_cubes(self, draws: Draws) -> None:
-        """Add cubes at random places; one that finds no place is left out."""
+    def _add_cubes(self, draws: Draws, colours: Sequence[str]) -> None:
+        """Add cubes of these colours; one that finds no place is left out."""
+        count = 0
+        for colour in colours:
+            name = f"{colour}_{len(self.cubes[colour])}"
+            avoid = [self.button, self.board, *self.all_cubes()]
+            slot = f"layout.slots.{count}"
+            try:
+                cube = add_cube(self, draws, f"cube_{name}", colour, TABLE, avoid, value=slot)
+            except SceneError:
+                continue
+            if not self.values.specified:
+                self.values.note(f"objects.slot_assignment.{count}", name)
+            self.cubes[colour].append(cube)
+            count += 1
+
+    def _draw_colours(self, draws: Draws) -> list[str]:
+        """The colours of the cubes in random order."""
         colours: list[str] = []
         for colour in SAMPLED_COLOURS:
             colours += [colour] * self.spawned[colour]
-        count = 0
-        for i in draws.permutation(len(colours)):
-            colour = colours[i]
-            place = draw_cube(draws, TABLE, [self.button, self.board, *self.all_cubes()], gap=H)
-            if place is not None:
-                (x, y), yaw = place
-                name = f"{colour}_{len(self.cubes[colour])}"
-                self.values.note(f"layout.slots.{count}", [x, y, yaw])
-                self.values.note(f"objects.slot_assignment.{count}", name)
-                self._add_cube(colour, [x, y, yaw])
-                count += 1
+        return [colours[i] for i in draws.permutation(len(colours))]
 
-    def _read_cubes(self) -> None:
-        """Add the cubes of the row."""
-        names: Any = self.values("objects.slot_assignment", list)
+    def _read_colours(self) -> list[str]:
+        """The colours of the row's cubes."""
+        names: list[str] = self.values("objects.slot_assignment", list, list[str])
         count = self.values.count("layout.slots")
-        if not isinstance(names, list) or len(names) != count:
-            raise self.values.error(
-                "objects.slot_assignment", f"must name a cube for each of the {count} slots"
+        self.values.require(
+            len(names) == count,
+            "objects.slot_assignment",
+            f"must name a cube for each of the {count} slots",
+        )
+        colours = [name.split("_")[0] for name in names]
+        for i, colour in enumerate(colours):
+            self.values.require(
+                colour in SAMPLED_COLOURS,
+                f"objects.slot_assignment.{i}",
+                f"is {names[i]!r}; expected {', '.join(SAMPLED_COLOURS)}",
             )
-        for i, name in enumerate(names):
-            colour = str(name).split("_")[0]
-            if colour not in SAMPLED_COLOURS:
-                raise self.values.error(
-                    f"objects.slot_assignment.{i}",
-                    f"is {name!r}; expected {', '.join(SAMPLED_COLOURS)}",
-                )
-            self._add_cube(colour, self.values.place(f"layout.slots.{i}", list, size=3))
-
-    def _add_cube(self, colour: str, place: Sequence[float]) -> None:
-        x, y, yaw = place
-        self.values.occupy("layout.slots", (x, y), H, yaw)
-        cubes = self.cubes[colour]
-        cube = build_cube(self, f"cube_{colour}_{len(cubes)}", colour, (x, y), yaw)
-        cubes.append(self.add(cube))
+        return colours
 
     def start_episode(self, draws: Draws) -> None:
         order = self.values.indices(

@@ -14,7 +14,6 @@ class ButtonUnmask(Unmask):
     """Containers cover three cubes while the robot presses a button."""
 
     letters = ("b", "c")
-    dials = frozenset({"containers"})
 
     def build(self, draws: Draws) -> None:
         self.button = add_button(self, draws, (-0.2, 0), (0.1, 0.1))

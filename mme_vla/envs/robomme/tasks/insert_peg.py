@@ -5,12 +5,12 @@ same with that peg.
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from copy import deepcopy
 from functools import partial
 from typing import Any
 
 import numpy as np
 import sapien
+from pydantic import FiniteFloat
 
 from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.control import PlanningError
@@ -28,6 +28,7 @@ from mme_vla.envs.robomme.scene.objects import (
 from mme_vla.envs.robomme.scene.placement import Draws, Point, SceneError
 from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up
 from mme_vla.envs.robomme.scene.things import Thing, distance_xy
+from mme_vla.envs.robomme.scene.values import Coordinate
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import end_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
@@ -75,8 +76,7 @@ class InsertPeg(Task):
             xy = (0.2, 0.2 * (i - 1))
             peg = build_peg(self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, xy, 0)
             self.pegs.append(self.add(peg))
-        if not self.pegs:
-            raise self.values.error("initializations.pegs", "is missing or empty")
+        self.values.require(self.pegs, "initializations.pegs", "is missing or empty")
         self.peg = self.pegs[0]
         self.wrong_ends = [end for peg in self.pegs[1:] for end in (peg.head, peg.tail)]
         self._disc = build_highlight(self, "disc", *MARK, APERTURE_COLOUR)
@@ -108,16 +108,11 @@ class InsertPeg(Task):
         """Place and yaw of each peg of the row."""
         values = self.values
         pegs: list[tuple[Point, float]] = []
-        for i, entry in enumerate(values.find("initializations.pegs")):
-            name = f"initializations.pegs.{i}"
-            if not isinstance(entry, list) or len(entry) != 2:
-                raise values.error(name, f"is {entry!r}; expected [[x, y], yaw]")
-            if isinstance(entry[0], list):
-                entry = [*entry[0], entry[1]]
-            x, y, yaw = values.check_place(name, entry, 3)
-            if any(math.dist((x, y), other) < PEG_RADIUS for other, _ in pegs):
-                raise values.error(name, "overlaps another peg")
-            pegs.append(((x, y), yaw))
+        kind = list[tuple[tuple[Coordinate, Coordinate], FiniteFloat]]
+        for i, (place, yaw) in enumerate(values.read("initializations.pegs", kind)):
+            clear = all(math.dist(place, other) >= PEG_RADIUS for other, _ in pegs)
+            values.require(clear, f"initializations.pegs.{i}", "overlaps another peg")
+            pegs.append((place, yaw))
         return pegs
 
     def _draw_pegs(self, draws: Draws, box: Point) -> list[tuple[Point, float]]:
@@ -140,10 +135,8 @@ class InsertPeg(Task):
         """The first two pegs, of which the video takes one, change places."""
         if len(self.pegs) < 2:
             return None
-        values = deepcopy(self.values.spec)
-        pegs = values["initializations"][-1]["pegs"]
-        pegs[0], pegs[1] = pegs[1], pegs[0]
-        return values
+        first, second, *others = self.values.find("initializations.pegs")
+        return self.values.changed({"initializations.pegs": [second, first, *others]})
 
     def candidates(self) -> Candidates | None:
         """The pegs, before one is grasped."""

@@ -4,7 +4,6 @@ same manner.
 
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -55,7 +54,6 @@ class MoveCube(Task):
     """
 
     shared_draws = True
-    dials = frozenset({"delay"})
 
     def build(self, draws: Draws) -> None:
         for _ in range(2):
@@ -107,8 +105,8 @@ class MoveCube(Task):
         """Place and yaw [3] of the cube in the video (`demo`) or in the execution."""
         name = f"layout.{part}.cube_pose"
         x, y, yaw = self.values.place(name, lambda: self._draw_cube(draws, goal, avoid), size=3)
-        if self.values.specified and math.dist((x, y), goal) <= H:
-            raise self.values.error(name, f"overlaps spec.layout.{part}.goal_xy")
+        clear = not self.values.specified or math.dist((x, y), goal) > H
+        self.values.require(clear, name, f"overlaps spec.layout.{part}.goal_xy")
         return [x, y, yaw]
 
     def _draw_cube(
@@ -138,10 +136,8 @@ class MoveCube(Task):
 
     def flip_fact(self) -> dict[str, Any]:
         """The video takes the peg instead of the cube, or the cube instead of the peg."""
-        values = deepcopy(self.values.spec)
         manner = "grasp" if self.manner == "hook" else "hook"
-        values["initializations"][-1]["way_idx"] = MANNERS.index(manner)
-        return values
+        return self.values.changed({"initializations.way_idx": MANNERS.index(manner)})
 
     def candidates(self) -> Candidates | None:
         """The peg and the cube: what the manner of the video begins with."""
@@ -188,7 +184,7 @@ class MoveCube(Task):
             SubTask(
                 "Hook the cube to the target with the peg",
                 done=self._pushed,
-                run=self._demonstrate_hook,
+                run=self._demonstrate_move,
                 grounded="Hook the cube at <> to the target at <> with the peg",
                 targets=[self.cube, self.target],
                 choice="b",
@@ -196,20 +192,11 @@ class MoveCube(Task):
             ),
         ]
 
-    def _demonstrate_hook(self, demo: Demonstrator) -> None:
-        demo.hook(self.cube, self.target)
-        tries = MORE_TRIES if self.second_tries else 0
-        for _ in range(tries):
-            if not self._pushed():
-                demo.withdraw()
-                demo.grasp_peg(self.peg, "tail")
-                demo.hook(self.cube, self.target)
-
     def _push(self, video: bool) -> list[SubTask]:
         push = SubTask(
             "Close the gripper and push the cube to the target",
             done=self._pushed,
-            run=self._demonstrate_push,
+            run=self._demonstrate_move,
             grounded="Close the gripper and push the cube at <> to the target at <>",
             failed=lambda: self._holds_cube() or self._holds_peg(),
             targets=[self.cube, self.target],
@@ -219,13 +206,17 @@ class MoveCube(Task):
         )
         return [push]
 
-    def _demonstrate_push(self, demo: Demonstrator) -> None:
-        demo.push(self.cube, self.target)
+    def _demonstrate_move(self, demo: Demonstrator) -> None:
+        """Hook or push as the benchmark does, and again where the cube did not stay."""
+        move = demo.hook if self.manner == "hook" else demo.push
+        move(self.cube, self.target)
         tries = MORE_TRIES if self.second_tries else 0
         for _ in range(tries):
             if not self._pushed():
                 demo.withdraw()
-                demo.push(self.cube, self.target)
+                if self.manner == "hook":
+                    demo.grasp_peg(self.peg, "tail")
+                move(self.cube, self.target)
 
     def _grasp(self, video: bool) -> list[SubTask]:
         return [

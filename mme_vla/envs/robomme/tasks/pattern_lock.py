@@ -5,7 +5,6 @@ again.
 import itertools
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from functools import partial
 from typing import Any
 
@@ -49,7 +48,6 @@ class PatternLock(Task):
     """Rows of the grid run along x, columns along y."""
 
     stick = True
-    dials = frozenset({"path"})
 
     def build(self, draws: Draws) -> None:
         n = GRID[self.difficulty]
@@ -62,10 +60,11 @@ class PatternLock(Task):
             self.discs.append(self.add(build_disc(self, name, 0.02, 0.01, "gray", (x, y))))
         nodes = self.values.indices("actions.path_nodes", lambda: self._draw_path(draws, n), n * n)
         steps = [np.subtract(divmod(a, n), divmod(b, n)) for a, b in itertools.pairwise(nodes)]
-        if len(nodes) < 2 or any(np.abs(step).max() > 1 for step in steps):
-            raise self.values.error(
-                "actions.path_nodes", f"is {nodes}; expected a path over neighbours, {n} a row"
-            )
+        self.values.require(
+            steps and all(np.abs(step).max() <= 1 for step in steps),
+            "actions.path_nodes",
+            f"is {nodes}; expected a path over neighbours, {n} a row",
+        )
         self.path = [self.discs[i] for i in nodes]
         self._marks = [
             build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(n * n)
@@ -96,9 +95,7 @@ class PatternLock(Task):
             goal = draws.integer(0, n * n)
             other = search(draws, n, nodes[0], goal, {nodes[0]}) or []
             if len(other) == len(nodes) and other[1] != nodes[1]:
-                values = deepcopy(self.values.spec)
-                values["actions"]["path_nodes"] = other
-                return values
+                return self.values.changed({"actions.path_nodes": other})
         return None
 
     def candidates(self) -> Candidates | None:

@@ -3,7 +3,6 @@ pick up just those.
 """
 
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 from mme_vla.envs.facts import Candidates, VisibleFact
@@ -38,7 +37,6 @@ class PickHighlight(Task):
     """Success needs every highlighted cube to have been picked up once, in any order."""
 
     latch_failure = True
-    dials = frozenset({"distractors"})
 
     def build(self, draws: Draws) -> None:
         self.button = add_button(self, draws, (-0.2, 0))
@@ -50,8 +48,7 @@ class PickHighlight(Task):
             lambda: draws.permutation(count)[: GOALS[self.difficulty]],
             count,
         )
-        if not goals:
-            raise self.values.error("objects.highlight_ids", "is empty; expected at least one cube")
+        self.values.require(goals, "objects.highlight_ids", "is empty; expected at least one cube")
         self.goal_cubes = [self.cubes[i] for i in goals]
         self._discs = [
             build_highlight(self, f"highlight_{i}", 0.05, 0.001) for i in range(len(goals))
@@ -90,9 +87,7 @@ class PickHighlight(Task):
         others = [i for i, cube in enumerate(self.cubes) if cube in self.other_cubes]
         if len(others) < count:
             return None
-        values = deepcopy(self.values.spec)
-        values["objects"]["highlight_ids"] = others[:count]
-        return values
+        return self.values.changed({"objects.highlight_ids": others[:count]})
 
     def candidates(self) -> Candidates | None:
         """Any highlighted cube that has not been picked up is correct."""

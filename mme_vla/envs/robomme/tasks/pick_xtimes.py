@@ -36,7 +36,6 @@ class PickXtimes(Task):
     """One cube is picked up and placed on the target again and again, as often as the goal says."""
 
     latch_failure = True
-    dials = frozenset({"count"})
     fact_choices = "b"
 
     def plan(self, draws: Draws) -> None:

@@ -4,7 +4,6 @@ route.
 
 import itertools
 import math
-from copy import deepcopy
 from functools import partial
 from typing import Any, Literal
 
@@ -76,21 +75,20 @@ class RouteStick(Task):
         route = values.indices(
             "actions.route", lambda: self._sample_route(draws), count, distinct=False
         )
-        if len(route) < 2 or any(abs(a - b) != 1 for a, b in itertools.pairwise(route)):
-            raise values.error(
-                "actions.route", f"is {route}; expected a way from disc to neighbouring disc"
-            )
         moves = len(route) - 1
+        values.require(
+            moves > 0 and all(abs(a - b) == 1 for a, b in itertools.pairwise(route)),
+            "actions.route",
+            f"is {route}; expected a way from disc to neighbouring disc",
+        )
 
         def sample() -> list[str]:
             return ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
 
         self.route = [self.discs[i] for i in route]
         self.directions: list[Direction] = values.words("actions.turns", sample, TURNS)  # type: ignore[assignment]
-        if len(self.directions) != moves:
-            raise values.error(
-                "actions.turns", f"has {len(self.directions)} turns for {moves} moves"
-            )
+        turns = len(self.directions)
+        values.require(turns == moves, "actions.turns", f"has {turns} turns for {moves} moves")
 
     def _sample_route(self, draws: Draws) -> list[int]:
         low, high = MOVES[self.difficulty]
@@ -111,9 +109,7 @@ class RouteStick(Task):
         mirrored = [2 * route[0] - i for i in route]
         if not all(0 <= i < len(self.discs) for i in mirrored):
             return None
-        values = deepcopy(self.values.spec)
-        values["actions"]["route"] = mirrored
-        return values
+        return self.values.changed({"actions.route": mirrored})
 
     def candidates(self) -> Candidates | None:
         """The discs beside the one that the next move starts from."""

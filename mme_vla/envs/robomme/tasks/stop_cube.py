@@ -34,7 +34,6 @@ class StopCube(Task):
     """The difficulty changes nothing."""
 
     latch_failure = True
-    dials = frozenset({"count"})
 
     def build(self, draws: Draws) -> None:
         self.passes = self.values.integer(

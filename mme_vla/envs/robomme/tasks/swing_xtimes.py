@@ -67,7 +67,6 @@ class SwingXtimes(Task):
     """The cube goes right, then left, `repetitions` times."""
 
     latch_failure = True
-    dials = frozenset({"count"})
     fact_choices = "b"
 
     def plan(self, draws: Draws) -> None:

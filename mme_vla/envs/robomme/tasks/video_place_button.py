@@ -2,7 +2,6 @@
 was pressed.
 """
 
-from copy import deepcopy
 from typing import Any, ClassVar
 
 from mme_vla.envs.robomme.scene.objects import Disc
@@ -26,10 +25,11 @@ class VideoPlaceButton(VideoPlace):
         self._visited_before = [0, *self._further_visits("before")]
         self._visited_after = [1, *self._further_visits("after")]
         goal = values.find("actions.target_target_id")
-        if goal is not None and goal != self.targets.index(self.goal_target):
-            raise values.error(
-                "actions.target_target_id", f"is {goal}; the other values give another target"
-            )
+        values.require(
+            goal in (None, self.targets.index(self.goal_target)),
+            "actions.target_target_id",
+            f"is {goal}; the other values give another target",
+        )
 
     def _further_visits(self, when: str) -> list[int]:
         name = f"objects.extra_place_target_ids.{when}"
@@ -48,13 +48,15 @@ class VideoPlaceButton(VideoPlace):
 
         Where two targets change places later, it is the same two places.
         """
-        values = deepcopy(self.values.spec)
-        places = values["layout"]["targets"]
-        places[0], places[1] = places[1], places[0]
+        first, second, *others = self.values.find("layout.targets")
         other = {0: 1, 1: 0}
-        swapped = values["objects"].get("swap_pair_ids") or []
-        values["objects"]["swap_pair_ids"] = [other.get(i, i) for i in swapped]
-        return values
+        swapped = self.values.find("objects.swap_pair_ids") or []
+        return self.values.changed(
+            {
+                "layout.targets": [second, first, *others],
+                "objects.swap_pair_ids": [other.get(i, i) for i in swapped],
+            }
+        )
 
     def visits(self) -> list[SubTask]:
         steps: list[SubTask] = []

@@ -33,8 +33,8 @@ class VideoPlaceOrder(VideoPlace):
 
         name = "objects.visit_ids_by_object"
         rows = max(values.count(name), 1)
-        if rows != len(self.demonstrated):
-            raise values.error(name, f"has {rows} lists for {len(self.demonstrated)} cubes")
+        cubes = len(self.demonstrated)
+        values.require(rows == cubes, name, f"has {rows} lists for {cubes} cubes")
         self._visits: list[tuple[Cube, list[Disc]]] = []
         total = 0
         for i, cube in enumerate(self.demonstrated):
@@ -60,15 +60,14 @@ class VideoPlaceOrder(VideoPlace):
         count = len(self.visited)
         if count < 2:
             return None
-        values = deepcopy(self.values.spec)
-        for cube, targets in zip(
-            self.demonstrated, values["objects"]["visit_ids_by_object"], strict=True
-        ):
+        name = "objects.visit_ids_by_object"
+        visits = deepcopy(self.values.find(name))
+        for cube, targets in zip(self.demonstrated, visits, strict=True):
             if self.cubes[cube] is self.cube:
                 first = self.rank - 1
                 second = self.rank % count
                 targets[first], targets[second] = targets[second], targets[first]
-        return values
+        return self.values.changed({name: visits})
 
     def visits(self) -> list[SubTask]:
         steps: list[SubTask] = []

@@ -3,7 +3,6 @@ now.
 """
 
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 from mme_vla.envs.facts import VisibleFact
@@ -13,9 +12,8 @@ from mme_vla.envs.robomme.scene.motions import (
     Cue,
     Swap,
     active_motions,
-    planned_swaps,
     row,
-    sequential_swaps,
+    swaps_in_turn,
     tally,
     under,
 )
@@ -35,6 +33,7 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     press_choice,
     put_down,
     put_down_choice,
+    read_swaps,
     wait,
 )
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
@@ -55,7 +54,6 @@ class VideoRepick(Task):
     shared_draws = True
     latch_failure = True
     recovery_sampled_per_episode = True
-    dials = frozenset({"count", "delay"})
     fact_choices = "a"
 
     def plan(self, draws: Draws) -> None:
@@ -80,25 +78,14 @@ class VideoRepick(Task):
         count = len(self.cubes)
         self.cube = self.cubes[values.integer("objects.target", lambda: target, most=count - 1)]
         self.wrong_cubes = [cube for cube in self.cubes if cube is not self.cube]
-        self.pairs = values.pairs("actions.swap_pairs", count)
-        if self.pairs is not None:
-            swaps = len(self.pairs)
-        else:
-            initiators = values.indices("actions.swap_initiators", lambda: initiators, count)
-            swaps = len(initiators)
-        self.initiators = [self.cubes[i] for i in initiators]
-        self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
-        if self.swap_count != swaps:
-            raise values.error(
-                "objects.n_swaps", f"is {self.swap_count}, and actions has {swaps} swaps"
-            )
+        self.swapped = read_swaps(self, self.cubes, lambda: initiators)
+        self.swap_count = len(self.swapped)
 
     def _read_cubes(self, draws: Draws) -> None:
         """Add the row's cubes, all of one colour or each of its own."""
         values = self.values
         count = values.count("layout.cubes")
-        if count < 1:
-            raise values.error("layout.cubes", "is missing or empty")
+        values.require(count, "layout.cubes", "is missing or empty")
         one_colour = values.find("objects.color_rgb") is not None
         for i in range(count):
             colour: str | RGB
@@ -143,10 +130,7 @@ class VideoRepick(Task):
 
     def before_physics(self, k: int) -> None:
         if self._swaps_due and not self.swaps:
-            if self.pairs is not None:
-                self.swaps = planned_swaps(self.pairs, self.cubes, start=k)
-            else:
-                self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
+            self.swaps = swaps_in_turn(self.swapped, self.cubes, start=k)
             self.motions = [*self.swaps]
         super().before_physics(k)
 
@@ -155,9 +139,8 @@ class VideoRepick(Task):
         count = len(self.cubes)
         if count < 2:
             return None
-        values = deepcopy(self.values.spec)
-        values["objects"]["target"] = (self.cubes.index(self.cube) + 1) % count
-        return values
+        following = (self.cubes.index(self.cube) + 1) % count
+        return self.values.changed({"objects.target": following})
 
     def cues(self) -> list[Cue]:
         def left() -> int:

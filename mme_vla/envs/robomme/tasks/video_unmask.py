@@ -14,8 +14,6 @@ from mme_vla.envs.subtasks import SubTask
 class VideoUnmask(Unmask):
     """Containers cover three cubes during the conditioning video."""
 
-    dials = frozenset({"containers", "delay"})
-
     def build(self, draws: Draws) -> None:
         self.build_containers(draws, [])
 

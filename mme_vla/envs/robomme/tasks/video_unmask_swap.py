@@ -13,8 +13,6 @@ from mme_vla.envs.subtasks import SubTask
 class VideoUnmaskSwap(UnmaskSwap):
     """Covering and swapping take place in the conditioning video."""
 
-    dials = frozenset({"swaps", "delay"})
-
     def build(self, draws: Draws) -> None:
         self.build_containers(draws, rotated_anchors(draws, CONTAINERS[self.difficulty]))
 

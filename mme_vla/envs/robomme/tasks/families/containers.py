@@ -3,7 +3,6 @@ them down.
 """
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,8 +17,7 @@ from mme_vla.envs.robomme.scene.motions import (
     Hide,
     Swap,
     active_motions,
-    planned_swaps,
-    sequential_swaps,
+    swaps_in_turn,
     under,
 )
 from mme_vla.envs.robomme.scene.objects import (
@@ -41,7 +39,7 @@ from mme_vla.envs.robomme.scene.placement import (
     draw_container,
 )
 from mme_vla.envs.robomme.scene.predicates import container_picked_up, container_put_down
-from mme_vla.envs.robomme.tasks.families.stages import sample_colours
+from mme_vla.envs.robomme.tasks.families.stages import read_swaps, sample_colours
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 
@@ -59,26 +57,20 @@ def add_container(
     region: Region,
     avoid: Sequence[Avoid],
     gap: float,
-) -> Container | None:
-    """Add a container at the row's place, or at a random one; None where it finds none."""
-    if env.values.specified:
-        return read_container(env, name, value)
-    sample = draw_container(draws, region, avoid, gap=gap)
-    if sample is None:
-        return None
-    (x, y), degrees = sample
-    place = [float(x), float(y), degrees]
-    env.values.note(value, place)
-    return _put_container(env, name, value, place)
+) -> Container:
+    """Add a container at the place that the row gives as `value`, or at a random one.
 
+    Raises:
+        SceneError: no place is free.
+    """
 
-def read_container(env: Task, name: str, value: str) -> Container:
-    """Add a container at the row's place."""
-    return _put_container(env, name, value, env.values.place(value, list, size=3))
+    def sample() -> list[float]:
+        place = draw_container(draws, region, avoid, gap=gap)
+        if place is None:
+            raise SceneError(f"{type(env).__name__}, seed {env.seed}: {name} finds no place.")
+        return [*place[0], place[1]]
 
-
-def _put_container(env: Task, name: str, value: str, place: Sequence[float]) -> Container:
-    x, y, degrees = place
+    x, y, degrees = env.values.place(value, sample, size=3)
     yaw = float(np.deg2rad(degrees))
     env.values.occupy(value, (x, y), CONTAINER_OUTER / 2, yaw)
     return env.add(build_container(env, name, (x, y), yaw))
@@ -99,16 +91,20 @@ class OuterContainers:
         part = "objects.distractors"
         if values.find(f"{part}.public") is not None:
             part = f"{part}.public"
+        table = Region((0, 0), WIDER_HALF)  # without effect: the row has their places
         for i in range(values.count(f"{part}.bins")):
-            self.containers.append(read_container(env, f"distractor_bin_{i}", f"{part}.bins.{i}"))
+            name = f"distractor_bin_{i}"
+            container = add_container(env, env.draws, name, f"{part}.bins.{i}", table, [], H)
+            self.containers.append(container)
         if not self.containers:
             return
         indices = values.indices(f"{part}.cube_bins", list, len(self.containers))
         colours = values.words(f"{part}.cube_colors", list, COLOURS)
-        if len(colours) != len(indices):
-            raise values.error(
-                f"{part}.cube_colors", f"has {len(colours)} colours for {len(indices)} cubes"
-            )
+        values.require(
+            len(colours) == len(indices),
+            f"{part}.cube_colors",
+            f"has {len(colours)} colours for {len(indices)} cubes",
+        )
         for j, (i, colour) in enumerate(zip(indices, colours, strict=True)):
             container = self.containers[i]
             name = f"distractor_cube_{j}_{colour}"
@@ -131,10 +127,11 @@ class ContainerTask(Task):
     def check_count(self) -> None:
         """Refuse a row with fewer containers than hidden cubes."""
         count = len(self.containers)
-        if count < MOST_PICKS:
-            raise self.values.error(
-                "layout.bins", f"has {count} containers; expected at least {MOST_PICKS}"
-            )
+        self.values.require(
+            count >= MOST_PICKS,
+            "layout.bins",
+            f"has {count} containers; expected at least {MOST_PICKS}",
+        )
 
     def hide_cubes(self) -> list[Cube]:
         """Put a small cube of each colour under its container."""
@@ -260,16 +257,13 @@ class Unmask(ContainerTask):
         if self.values.specified:
             count = self.values.count(part)
         for i in range(count):
-            container = add_container(
-                self,
-                draws,
-                f"container_{len(self.containers)}",
-                f"{part}.{i}",
-                Region((0, 0), half),
-                [*avoid, *self.containers],
-                gap,
-            )
-            if container is None:
+            name = f"container_{len(self.containers)}"
+            taken = [*avoid, *self.containers]
+            try:
+                container = add_container(
+                    self, draws, name, f"{part}.{i}", Region((0, 0), half), taken, gap
+                )
+            except SceneError:
                 return
             self.containers.append(container)
 
@@ -278,10 +272,8 @@ class Unmask(ContainerTask):
 
     def flip_fact(self) -> dict[str, Any]:
         """The first two containers change places, and their cubes with them."""
-        values = deepcopy(self.values.spec)
-        places = values["layout"]["bins"]
-        places[0], places[1] = places[1], places[0]
-        return values
+        first, second, *others = self.values.find("layout.bins")
+        return self.values.changed({"layout.bins": [second, first, *others]})
 
     def start_episode(self, draws: Draws) -> None:
         self.cover = Cover(self.containers, self.parking_group("inner"), self.contents)
@@ -296,8 +288,6 @@ PICKS = {"easy": (1, 2), "medium": (1, 1), "hard": (2, 2)}
 
 class UnmaskSwap(ContainerTask):
     """Where the containers stand, and what comes before the picks, is for the task to say."""
-
-    dials = frozenset({"swaps"})
 
     def plan(self, draws: Draws) -> None:
         low, high = SWAPS[self.difficulty]
@@ -327,51 +317,32 @@ class UnmaskSwap(ContainerTask):
             container = add_container(
                 self, draws, f"container_{i}", f"layout.bins.{i}", region, taken, H
             )
-            if container is None:
-                raise SceneError(f"No place for container {i} with seed {self.seed}.")
             self.containers.append(container)
         self.check_count()
         self.colours = sample_colours(self, draws, UNMASK_COLOURS)
         over = values.indices("objects.selected", lambda: draws.permutation(3), count)
-        if len(over) != len(self.colours):
-            raise values.error(
-                "objects.selected", f"has {len(over)} containers for {len(self.colours)} cubes"
-            )
+        values.require(
+            len(over) == len(self.colours),
+            "objects.selected",
+            f"has {len(over)} containers for {len(self.colours)} cubes",
+        )
         self.over_cubes = [self.containers[i] for i in over]
         self.cubes = self.hide_cubes()
-        self._plan_swaps(draws, count)
-        self.outer = OuterContainers(self)
-        name = "actions.distractor_swap_pairs"
-        self.outer_pairs = values.pairs(name, len(self.outer.containers)) or []
-        if len(self.outer_pairs) > self.swap_count:
-            problem = f"has {len(self.outer_pairs)} swaps, more than objects.n_swaps"
-            raise values.error(name, problem)
-
-    def _plan_swaps(self, draws: Draws, count: int) -> None:
-        """Which containers change places: both of a row's pair, or an initiator and whichever is
-        nearest then.
-        """
-        values = self.values
         self.swap_steps = values.integer(
             "actions.swap_window.duration_steps", lambda: SWAP_STEPS, least=1
         )
-        name = "actions.swap_pairs"
-        self.pairs = values.pairs(name, count)
-        self.initiators: list[Container] = []
-        if self.pairs is not None:
-            swaps = len(self.pairs)
-        else:
-            name = "actions.swap_initiators"
-            initiators = values.indices(
-                name, lambda: self._draw_initiators(draws, count), count, distinct=False
-            )
-            self.initiators = [self.containers[i] for i in initiators]
-            swaps = len(initiators)
-        self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
-        if self.swap_count != swaps:
-            raise values.error(
-                "objects.n_swaps", f"is {self.swap_count}, and {name} has {swaps} swaps"
-            )
+        self.swapped = read_swaps(
+            self, self.containers, lambda: self._draw_initiators(draws, count), distinct=False
+        )
+        self.swap_count = len(self.swapped)
+        self.outer = OuterContainers(self)
+        outer = self.outer.containers
+        name = "actions.distractor_swap_pairs"
+        self.outer_swapped = [(outer[a], outer[b]) for a, b in values.pairs(name, len(outer)) or []]
+        swaps = len(self.outer_swapped)
+        values.require(
+            swaps <= self.swap_count, name, f"has {swaps} swaps, more than objects.n_swaps"
+        )
 
     def _draw_initiators(self, draws: Draws, count: int) -> list[int]:
         draws.integer(0, count)  # part of the official stream, without effect
@@ -385,10 +356,8 @@ class UnmaskSwap(ContainerTask):
 
     def flip_fact(self) -> dict[str, Any]:
         """The first two cubes change places: each is under the other's container."""
-        values = deepcopy(self.values.spec)
-        over = values["objects"]["selected"]
-        over[0], over[1] = over[1], over[0]
-        return values
+        first, second, *others = self.values.find("objects.selected")
+        return self.values.changed({"objects.selected": [second, first, *others]})
 
     @property
     def swapped_after(self) -> int:
@@ -401,10 +370,7 @@ class UnmaskSwap(ContainerTask):
     def start_episode(self, draws: Draws) -> None:
         inner, outer = self.containers, self.outer.containers
         start, steps, end = COVER_STEPS, self.swap_steps, self.swapped_after
-        if self.pairs is None:
-            swaps = sequential_swaps(self.initiators, inner, start, steps)
-        else:
-            swaps = planned_swaps(self.pairs, inner, start, steps)
+        swaps = swaps_in_turn(self.swapped, inner, start, steps)
         cover = Cover(inner, self.parking_group("inner"), self.contents)
         pairs = list(zip(self.cubes, self.over_cubes, strict=True))
         self.visible_motions: list[Cover | Swap] = [cover, *swaps]
@@ -412,7 +378,7 @@ class UnmaskSwap(ContainerTask):
             cover,
             Cover(outer, self.parking_group("outer")),
             *swaps,
-            *planned_swaps(self.outer_pairs, outer, start, steps),
+            *swaps_in_turn(self.outer_swapped, outer, start, steps),
             Hide(pairs, start, end, self.parking_group("inner cubes")),
             Hide(self.outer.hidden, start, end, self.parking_group("outer cubes")),
         ]

@@ -99,10 +99,11 @@ def _cube_names(env: Task, part: str) -> list[str]:
     """Names such as `red_0` of the cubes in a part of the row."""
     names = env.values.names(part)
     for name in names:
-        if name.split("_")[0] not in COLOURS:
-            raise env.values.error(
-                f"{part}.{name}", f"has an unknown colour; expected one of {', '.join(COLOURS)}"
-            )
+        env.values.require(
+            name.split("_")[0] in COLOURS,
+            f"{part}.{name}",
+            f"has an unknown colour; expected one of {', '.join(COLOURS)}",
+        )
     return names
 
 
@@ -189,10 +190,40 @@ def check_colour(env: Task, colour: str | RGB) -> None:
     give.
     """
     stated = env.values.find("objects.target_color")
-    if stated not in (None, colour):
-        raise env.values.error(
-            "objects.target_color", f"is {stated!r}; the other values give {colour!r}"
-        )
+    env.values.require(
+        stated in (None, colour),
+        "objects.target_color",
+        f"is {stated!r}; the other values give {colour!r}",
+    )
+
+
+def read_swaps[T: Thing](
+    env: Task, things: Sequence[T], sample: Callable[[], list[int]], distinct: bool = True
+) -> list[tuple[T, T | None]]:
+    """The swaps in order, as `swaps_in_turn` takes them: both objects of the row's pairs, or
+    initiators alone, whose partner is whichever is nearest then.
+
+    Args:
+        things: the objects that change places.
+        sample: indices of the initiators.
+        distinct: each object begins one swap at most.
+    """
+    values, count = env.values, len(things)
+    swaps: list[tuple[T, T | None]] = []
+    name = "actions.swap_pairs"
+    pairs = values.pairs(name, count)
+    if pairs is not None:
+        for first, second in pairs:
+            swaps.append((things[first], things[second]))
+    else:
+        name = "actions.swap_initiators"
+        for i in values.indices(name, sample, count, distinct):
+            swaps.append((things[i], None))
+    stated = values.integer("objects.n_swaps", lambda: len(swaps))
+    values.require(
+        stated == len(swaps), "objects.n_swaps", f"is {stated}, and {name} has {len(swaps)} swaps"
+    )
+    return swaps
 
 
 def delay(env: Task) -> int:

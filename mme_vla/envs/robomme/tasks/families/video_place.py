@@ -59,7 +59,6 @@ class VideoPlace(Task):
     places.
     """
 
-    dials = frozenset({"delay"})
     fact_choices = "bc"
     spot_radius: ClassVar[float]
     """How far the spot where the video puts the cube at its end stays from the edge of
@@ -85,8 +84,9 @@ class VideoPlace(Task):
         self.demonstrated = values.indices(
             "objects.demo_ids", lambda: [draws.integer(0, n_cubes)], n_cubes
         )
-        if not self.demonstrated:
-            raise values.error("objects.demo_ids", "is empty; expected the cubes of the video")
+        values.require(
+            self.demonstrated, "objects.demo_ids", "is empty; expected the cubes of the video"
+        )
         self.cube = self.cubes[self.demonstrated[0]]
 
         def sample_swap() -> list[int]:
@@ -94,8 +94,11 @@ class VideoPlace(Task):
 
         swapped = values.indices("objects.swap_pair_ids", sample_swap, n_targets)
         self._swapped = [self.targets[i] for i in swapped[:2]]
-        if len(self._swapped) == 1:
-            raise values.error("objects.swap_pair_ids", "has one target; expected two, or none")
+        values.require(
+            len(self._swapped) != 1,
+            "objects.swap_pair_ids",
+            "has one target; expected two, or none",
+        )
         self.draw_script(draws)
         check_colour(self, self.cube.colour)
 
@@ -117,8 +120,9 @@ class VideoPlace(Task):
                 gap=H,
             )
             targets.append(target)
-        if count < 2:
-            raise self.values.error("layout.targets", f"has {count} targets; expected at least 2")
+        self.values.require(
+            count >= 2, "layout.targets", f"has {count} targets; expected at least 2"
+        )
         return targets
 
     @abstractmethod

@@ -2,15 +2,52 @@
 
 from dataclasses import fields
 from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
 
 from mme_vla.envs import metadata
 from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.make import check_names, make_env
-from mme_vla.envs.metadata import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
 from mme_vla.envs.observations import Include
-from mme_vla.errors import UserError, check_known
+from mme_vla.errors import UserError, check_known, require
+from mme_vla.utils import read_json
+from mme_vla.utils.validation import validated
 
 __all__ = ["BenchmarkEnvBuilder"]
+
+_Number = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+
+
+class _Episode(BaseModel):
+    """What is read of an episode in an official metadata file."""
+
+    episode: _Number
+    seed: _Number
+    difficulty: Literal["easy", "medium", "hard"]
+
+
+class _File(BaseModel):
+    """What is read of an official metadata file."""
+
+    records: Annotated[list[_Episode], Field(min_length=1)]
+
+
+def read_episodes(path: Path, task: str, split: str) -> list[EpisodeSpec]:
+    """The episodes that an official metadata file describes, in order."""
+    content = read_json(path, f"official metadata of {task}, split {split!r}")
+    try:
+        records = validated(_File, content, "The file").records
+    except UserError as error:
+        raise UserError(f"{path} is not official metadata: {error} Get the file again.") from None
+    specs = []
+    for record in records:
+        specs.append(EpisodeSpec(task, split, record.episode, record.seed, record.difficulty))
+    specs.sort(key=lambda spec: spec.episode)
+    is_complete = [spec.episode for spec in specs] == list(range(len(specs)))
+    require(is_complete, f"{path} does not number its episodes 0, 1, 2, …; get the file again.")
+    return specs
 
 
 class BenchmarkEnvBuilder:
@@ -43,7 +80,7 @@ class BenchmarkEnvBuilder:
                 "gui_render=True: these environments open no window. Leave it out, and use"
                 " render()."
             )
-        check_names(env_id, action_space, None, None)
+        check_names(env_id, action_space)
         self.env_id, self.dataset, self.action_space, self.max_steps = (
             env_id,
             dataset,
@@ -53,8 +90,8 @@ class BenchmarkEnvBuilder:
         if override_metadata_path is None:
             self._episodes = metadata.episodes(env_id, dataset)
         else:
-            file = Path(override_metadata_path) / metadata.file_name(env_id)
-            self._episodes = metadata.read_official(file, env_id, dataset)
+            file = Path(override_metadata_path) / f"record_dataset_{env_id}_metadata.json"
+            self._episodes = read_episodes(file, env_id, dataset)
 
     @classmethod
     def get_task_list(cls) -> list[str]:
