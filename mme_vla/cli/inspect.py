@@ -124,7 +124,12 @@ def main(cfg: DictConfig) -> None:
         return
     memory = build_memory(inspection)
     name = str(inspection.memory["name"])
-    image = draw_memory(source, episode, step, memory, name, Path(inspection.output), console)
+    try:
+        image = draw_memory(source, episode, step, memory, name, Path(inspection.output), console)
+    except UserError as error:
+        if words_of("memory"):
+            raise
+        image = f"none of memory={name}, the default. {error}"
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
 
 

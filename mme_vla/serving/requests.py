@@ -238,7 +238,7 @@ _RELEASED = {"front": "image", "wrist": "wrist_image"}
 
 
 def released_keys(robot: Embodiment) -> dict[str, str]:
-    """openpi's keys of RoboMME's cameras: of the robot's, where no other camera is called so."""
+    """The released keys of RoboMME's cameras, of those the robot has, where none is called so."""
     keys = {}
     for name, released in _RELEASED.items():
         if name in robot.camera_names and released not in robot.camera_names:
@@ -516,6 +516,7 @@ class RequestReader:
         if unknown:
             hint = did_you_mean(unknown[0], known)
         return UserError(f"No known request has the keys {keys}. {hint}")
+
 
 def _check_lengths(lengths: Mapping[str, int]) -> None:
     if len(set(lengths.values())) > 1:
