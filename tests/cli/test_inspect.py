@@ -110,8 +110,8 @@ def test_a_checkpoint_without_memory_has_none_to_render(tmp_path: Path) -> None:
 def test_images_that_the_default_memory_cannot_divide_say_which_to_choose(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = EpisodeSource.frames
-    cropped = lambda *arguments: whole(*arguments)[:, :94, :130]  # noqa: E731
+    frames = EpisodeSource.frames
+    cropped = lambda *arguments: frames(*arguments)[:, :94, :130]  # noqa: E731
     monkeypatch.setattr(EpisodeSource, "frames", cropped)
     words = ["dataset=sample", "episode=0", "step=20", f"output={tmp_path}"]
     main(compose("inspect", words))

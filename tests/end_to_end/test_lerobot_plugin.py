@@ -270,11 +270,11 @@ def test_statistics_and_steps_are_of_the_episodes_that_lerobot_trains_on(
     from lerobot.datasets import LeRobotDataset
     from lerobot_policy_mme_vla.samples import Samples
 
-    chosen = LeRobotDataset("local/sample", root=SAMPLE, episodes=[1, 3])
-    whole = LeRobotDataset("local/sample", root=SAMPLE)
+    part = LeRobotDataset("local/sample", root=SAMPLE, episodes=[1, 3])
+    full = LeRobotDataset("local/sample", root=SAMPLE)
     config = package.MMEVLAConfig(model="pi05", cache_root=str(tmp_path))
     printed, stats = [], []
-    for dataset in (whole, chosen):
+    for dataset in (full, part):
         model = small_policy("pi05")
         model.require_processor().stats = None
         samples = Samples(model, config, dataset.meta)
@@ -285,7 +285,7 @@ def test_statistics_and_steps_are_of_the_episodes_that_lerobot_trains_on(
     assert "in 4 episodes, 0 held-out steps in 0" in printed[0]
     assert "in 2 episodes" in printed[1] and "held-out steps in 2" in printed[1]
     assert not np.array_equal(stats[0].mean, stats[1].mean)
-    # `eval_split` asks for the loss of those that are held out
+    # `eval_split` computes the loss of held-out episodes too
     assert len(samples.batch(torch.tensor([100])).actions) == 1
 
 

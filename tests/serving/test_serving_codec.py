@@ -317,7 +317,7 @@ WHITE = np.full_like(IMAGE, 255)
 
 
 @pytest.mark.parametrize("key", ["observation/front", "observation/image"])
-def test_a_camera_has_its_own_key_and_the_released_one(key):
+def test_a_camera_has_the_key_of_its_name_and_the_released_one(key):
     sent = {"observation/state": states(1)[0], "prompt": GOAL, "observation/wrist": IMAGE}
     assert parse({**sent, key: WHITE}).views["front"].min() == 255
     with pytest.raises(UserError, match=f"{key} must be a uint8 image"):

@@ -34,7 +34,7 @@ class Samples:
 
     def __init__(self, model: Policy, config: "MMEVLAConfig", meta: Any) -> None:
         self._model, self._config = model, config
-        self._held_out = _held_out(meta)
+        self._val_episodes = _val_episodes(meta)
         self._entry = {
             "root": str(meta.root),
             "name": meta.repo_id.replace("/", "_"),
@@ -48,8 +48,8 @@ class Samples:
         items = []
         for row in rows.flatten().tolist():
             episode, frame = split.train.sources[0].locate(row)
-            # LeRobot's `eval_split` asks for the loss of episodes that are held out.
-            steps = split.val if episode in self._held_out else split.train
+            # LeRobot's `eval_split` computes the loss of held-out episodes too.
+            steps = split.val if episode in self._val_episodes else split.train
             items.append(steps[steps.item_at(0, episode, frame)])
         return split.train.processor.collate(items)
 
@@ -58,13 +58,13 @@ class Samples:
             processor = self._model.require_processor()
             known = processor.stats
             with _one_first(self._config.cache_local):
-                self._split = _split(self._model, self._config, self._entry, self._held_out)
+                self._split = _split(self._model, self._config, self._entry, self._val_episodes)
             if known is not None:
                 processor.stats = known  # those that the weights were trained with
         return self._split
 
 
-def _held_out(meta: Any) -> list[int]:
+def _val_episodes(meta: Any) -> list[int]:
     """The episodes that LeRobot does not train on (`--dataset.episodes`, `--dataset.eval_split`).
 
     It hands policies the metadata alone, so the dataset that was opened with these is searched for.
@@ -104,13 +104,13 @@ def _one_first(of_machine: bool) -> Iterator[None]:
 
 
 def _split(
-    model: Policy, config: "MMEVLAConfig", entry: dict[str, Any], held_out: list[int]
+    model: Policy, config: "MMEVLAConfig", entry: dict[str, Any], val_episodes: list[int]
 ) -> SplitData:
     data = {
         "name": entry["name"],
         "sources": [entry],
         "val_fraction": 0.0,
-        "val_episodes": held_out,
+        "val_episodes": val_episodes,
         "action_offset": action_offset_of(model),
         "mask_padding": False,
         "jitter": False,
