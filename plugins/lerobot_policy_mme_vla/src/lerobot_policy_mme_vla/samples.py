@@ -49,7 +49,7 @@ class Samples:
         for row in rows.flatten().tolist():
             episode, frame = split.train.sources[0].locate(row)
             # LeRobot's `eval_split` computes the loss of held-out episodes too.
-            steps = split.val if episode in self._val_episodes else split.train
+            steps: Any = split.val if episode in self._val_episodes else split.train
             items.append(steps[steps.item_at(0, episode, frame)])
         return split.train.processor.collate(items)
 
