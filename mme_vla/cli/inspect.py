@@ -124,8 +124,14 @@ def main(cfg: DictConfig) -> None:
         return
     memory = build_memory(inspection)
     name = str(inspection.memory["name"])
-    image = draw_memory(source, episode, step, memory, name, Path(inspection.output), console)
-    console.print(f"image: {image}", highlight=False, soft_wrap=True)
+    try:
+        image = draw_memory(source, episode, step, memory, name, Path(inspection.output), console)
+        shown = str(image)
+    except UserError as error:
+        if words_of("memory"):
+            raise
+        shown = f"none of memory={name}, the default. {error}"
+    console.print(f"image: {shown}", highlight=False, soft_wrap=True)
 
 
 def show_self_check(inspection: Inspection, console: Console) -> None:

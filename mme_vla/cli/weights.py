@@ -109,6 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--dtype", default="float32", choices=list(DTYPES), help="what weights are stored in"
     )
+    parser.add_argument("--config-dir", metavar="DIR", help="search YAML files of your own too")
     parser.add_argument("--asset", help="which dataset's statistics, where the source has several")
     parser.add_argument("--revision", help="branch, tag or commit of a hub repository")
     parser.add_argument(
@@ -136,6 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args.overrides,
             to=args.to,
             dtype=args.dtype,
+            config_dir=args.config_dir,
             asset=args.asset,
             revision=args.revision,
             base=args.base,
@@ -151,6 +153,7 @@ def convert(
     *,
     to: str = "ours",
     dtype: str = "float32",
+    config_dir: str | Path | None = None,
     asset: str | None = None,
     revision: str | None = None,
     base: str | Path | None = None,
@@ -168,7 +171,8 @@ def convert(
         f"{target} exists: give a new folder, nothing is ever written over.",
     )
     opened = open_source(source, revision, base=base)
-    policy = _policy(opened, overrides, trust_plugins)
+    trees = [] if config_dir is None else [Path(config_dir).resolve()]
+    policy = _policy(opened, overrides, trees, trust_plugins)
     check_target(policy, to)
     tensors = read_as(policy, opened)
     if dry_run:
@@ -193,7 +197,9 @@ def convert(
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Policy:
+def _policy(
+    opened: Source, overrides: Sequence[str], trees: Sequence[Path], trust_plugins: bool
+) -> Policy:
     """The policy a source belongs to, on meta, with its processor if that can be had."""
     from mme_vla.config.composition import compose
     from mme_vla.processing.base import load_processor
@@ -241,9 +247,10 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
     if opened.lacks_positions and "memory.positions" not in settings:
         words.append("memory.positions=none")
     print(f"Reading {opened.label} as {' '.join(words)}", file=sys.stderr)
-    composed = compose("policy", words)
+    composed = compose("policy", words, extra_dirs=trees)
     if "backbone" not in settings:
-        composed = compose("policy", [*words, f"backbone={composed.full_size}"])
+        words.append(f"backbone={composed.full_size}")
+        composed = compose("policy", words, extra_dirs=trees)
 
     method = method_formats().get(opened.format)
     if method is not None and method.configure is not None:

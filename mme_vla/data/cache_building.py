@@ -36,6 +36,7 @@ from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory
+from mme_vla.memory.history import score_frame
 from mme_vla.utils import remove_drafts, sum_line, write_atomically, write_json
 
 PAGE = 4096  # bytes
@@ -179,10 +180,17 @@ def _chunks(
             chunk = _Chunk(episode, stop - start, stored_images, [], [])
             if scorer is not None:
                 for frame, image in zip(required.tolist(), images, strict=True):
-                    row = scorer(frame, image)
+                    try:
+                        row = score_frame(scorer, frame, image)
+                    except UserError as error:
+                        camera = source.robot.memory_camera
+                        column = source.columns[camera]
+                        raise UserError(
+                            f"{source.root}, {column} (the camera {camera!r}): {error}"
+                        ) from None
                     if row is not None:
                         chunk.score_frames.append(frame)
-                        chunk.score_values.append(np.asarray(row, np.float32))
+                        chunk.score_values.append(row)
             yield chunk
 
 

@@ -33,6 +33,12 @@ class Camera:
     depth: StrictBool = False
 
     @property
+    def lerobot_key(self) -> str:
+        """The column of its images by LeRobot's name; a key that is such a name stays."""
+        name = self.key or self.name
+        return name if name.startswith("observation.") else f"observation.images.{name}"
+
+    @property
     def readings(self) -> tuple[str, ...]:
         """What is delivered beside the images: depth [H, W, 1] int16 in millimetres, and the
         camera's pose [3, 4].

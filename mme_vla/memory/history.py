@@ -7,6 +7,7 @@ A history grows in an episode (`OnlineHistory`, `LazyHistory`) or is read from t
 import ast
 import hashlib
 import inspect
+import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -136,6 +137,27 @@ class FrameScores:
         return FrameScores(self.frames[:count], self.values[:count])
 
 
+def score_frame(scorer: FrameScorer, frame: int, image: np.ndarray) -> np.ndarray | None:
+    """What the scorer gives for a frame, RGB [H, W, 3] uint8, as float32.
+
+    Raises:
+        UserError: an image that it does not take; of a size that does not fit, with what would.
+    """
+    try:
+        row = scorer(frame, image)
+    except UserError as error:
+        grid = getattr(scorer, "grid", 1)
+        fitting = math.gcd(grid, *image.shape[:2])
+        if fitting == grid:
+            raise
+        raise UserError(
+            f"{error} Scale the images to sides that are multiples of {grid}, set"
+            f" memory.grid={fitting}, or choose a memory that compares no images"
+            " (memory=framesamp)."
+        ) from None
+    return None if row is None else np.array(row, np.float32)
+
+
 def score_frames(
     scorer: FrameScorer | None, images: Mapping[int, np.ndarray], patches: int
 ) -> FrameScores:
@@ -147,9 +169,9 @@ def score_frames(
     """
     rows: dict[int, np.ndarray] = {}
     for frame in sorted(images):
-        values = None if scorer is None else scorer(frame, images[frame])
+        values = None if scorer is None else score_frame(scorer, frame, images[frame])
         if values is not None:
-            rows[frame] = np.asarray(values, np.float32)
+            rows[frame] = values
     if not rows:
         return FrameScores.empty(patches)
     return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
@@ -387,10 +409,10 @@ class OnlineHistory(History):
         if self._scorer is None:
             return
         for frame, image in zip((offsets + self._length).tolist(), frames, strict=True):
-            values = self._scorer(frame, image)
+            values = score_frame(self._scorer, frame, image)
             if values is not None:
                 self._scored_frames.append(frame)
-                self._score_rows.append(np.array(values, np.float32))
+                self._score_rows.append(values)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:

@@ -249,7 +249,7 @@ class _Upsampled(FrameScorer):
 
     def __init__(self, scorer: FrameScorer, grid: int, fine: int) -> None:
         self._scorer = scorer
-        self._grid = grid
+        self.grid = grid
         self._times = fine // grid
 
     @property
@@ -264,7 +264,7 @@ class _Upsampled(FrameScorer):
         row = self._scorer(frame_index, frame)
         if row is None:
             return None
-        cells = row.reshape(self._grid, self._grid)
+        cells = row.reshape(self.grid, self.grid)
         return np.kron(cells, np.ones((self._times, self._times), row.dtype)).reshape(-1)
 
 

@@ -221,6 +221,7 @@ class Episode:
             return
         if states is not None:
             states = finite_array(states, "states")
+            check_reach(states, self._state_stats(), "a state")
         demo, executed = self._checked_course(len(frames), demo, actions)
         self._take(FrameBatch.of(frames), demo, executed, states)
 

@@ -396,5 +396,5 @@ def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> N
         raise UserError(
             f"{what} has {values[place]:.4g} for number {d + 1} of {values.shape[-1]}; in the"
             f" training data it lies within {stats.q01[d]:.4g} and {stats.q99[d]:.4g}. Check the"
-            " driver and the units (radians)."
+            " driver and the units."
         )

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import (
     AfterValidator,
+    AliasChoices,
     BaseModel,
     BeforeValidator,
     FailFast,
@@ -233,8 +234,16 @@ def _shaped(*shape: int | None) -> Any:
 
 # Messages.
 
-IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}
-"""openpi's names of RoboMME's cameras."""
+_RELEASED = {"front": "image", "wrist": "wrist_image"}
+
+
+def released_keys(robot: Embodiment) -> dict[str, str]:
+    """The released keys of RoboMME's cameras, of those the robot has, where none is called so."""
+    keys = {}
+    for name, released in _RELEASED.items():
+        if name in robot.camera_names and released not in robot.camera_names:
+            keys[name] = f"observation/{released}"
+    return keys
 
 
 Index = Annotated[StrictInt, Field(ge=0), BeforeValidator(_integer)]
@@ -298,6 +307,7 @@ class RequestReader:
 
     def __init__(self, robot: Embodiment, most_frames: int) -> None:
         self._robot = robot
+        self._released = released_keys(robot)
         width = robot.state.width
         counted = BeforeValidator(partial(_counted, least=1, most=most_frames))
         # A choice may move nothing, and the next request then has no new frame.
@@ -314,8 +324,10 @@ class RequestReader:
         observed: dict[str, Any] = {"state": (_shaped(width), Field(alias="observation/state"))}
         listed: dict[str, Any] = {}
         for camera in robot.cameras:
-            key = IMAGE_KEYS.get(camera.name, f"observation/{camera.name}")
-            observed[f"see_{camera.name}"] = (Image, Field(alias=key))
+            keys = [f"observation/{camera.name}"]
+            if camera.name in self._released:
+                keys.append(self._released[camera.name])
+            observed[f"see_{camera.name}"] = (Image, Field(validation_alias=AliasChoices(*keys)))
             listed[f"see_{camera.name}"] = (one_size, Field(alias=f"{camera.name}_rgb_list"))
             if camera.depth:
                 depth_name, pose_name = camera.readings
@@ -371,7 +383,7 @@ class RequestReader:
         keys = [key for key in message if isinstance(key, str)]
         if any(key.startswith("observation/") for key in keys):
             return self._one_observation(message)
-        raise _unknown(keys[:10], self._robot.camera_names[0])
+        raise self._unknown(keys[:10])
 
     def _add_buffer(self, message: dict[Any, Any]) -> AddBuffer:
         readings = ", ".join(self._robot.readings)
@@ -385,6 +397,12 @@ class RequestReader:
         return AddBuffer(buffer.images, buffer.exec_start_idx, buffer.state)
 
     def _one_observation(self, message: dict[Any, Any]) -> Infer:
+        for name, released in self._released.items():
+            require(
+                released not in message or f"observation/{name}" not in message,
+                f"observation/{name} and {released} are both images of the camera {name!r}: send"
+                " one of them.",
+            )
         observation: Any = validated(self._observation, message, "The request")
         views = {name: view[None] for name, view in self._views(observation).items()}
         self._check_depth(views, "observation/{}")
@@ -480,25 +498,27 @@ class RequestReader:
             return ()
         return read_options(message.available_multi_choices, letters)
 
+    def _unknown(self, keys: list[str]) -> UserError:
+        """Explain that these keys are of no request of this robot."""
+        camera = self._robot.camera_names[0]
+        image, images = f"observation/{camera}", f"{camera}_rgb_list"
+        known = ["reset", "add_buffer", image, images]
+        if camera in self._released:
+            known.append(self._released[camera])
+        unknown = [key for key in keys if key not in known]
+        if keys and not unknown:  # reset=true and add_buffer=true are requests
+            false = " and ".join(f"{key}=false" for key in keys)
+            return UserError(
+                f"{false}: no request. Send reset=true, or an observation with the keys"
+                f" {image}, … or {images}, …"
+            )
+        hint = f"Known: {', '.join(known)}."
+        if unknown:
+            hint = did_you_mean(unknown[0], known)
+        return UserError(f"No known request has the keys {keys}. {hint}")
+
 
 def _check_lengths(lengths: Mapping[str, int]) -> None:
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{key} has {length}" for key, length in lengths.items())
         raise UserError(f"All lists need one entry a frame: {counts}.")
-
-
-def _unknown(keys: list[str], camera: str) -> UserError:
-    """Explain that these keys are of no request of a robot with this camera."""
-    image = IMAGE_KEYS.get(camera, f"observation/{camera}")
-    known = ("reset", "add_buffer", image, f"{camera}_rgb_list")
-    unknown = [key for key in keys if key not in known]
-    if keys and not unknown:  # reset=true and add_buffer=true are requests
-        false = " and ".join(f"{key}=false" for key in keys)
-        return UserError(
-            f"{false}: no request. Send reset=true, or an observation with the keys"
-            f" {image}, … or {camera}_rgb_list, …"
-        )
-    hint = f"Known: {', '.join(known)}."
-    if unknown:
-        hint = did_you_mean(unknown[0], known)
-    return UserError(f"No known request has the keys {keys}. {hint}")

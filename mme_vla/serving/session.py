@@ -15,6 +15,7 @@ import numpy as np
 from mme_vla.embodiment.robomme import benchmark_action
 from mme_vla.errors import UserError
 from mme_vla.policy.base import frames_a_piece
+from mme_vla.processing.normalise import check_reach
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.engine import Engine
 from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset
@@ -86,6 +87,7 @@ class Session:
         count = len(request.frames)
         self._check_capacity(count)
         robot = self._engine.policy.embodiment
+        self._check_states(request.states)
         self._check_sizes("add_buffer", {robot.memory_camera: request.frames})
         self.intact = False
         if request.exec_start > 0:
@@ -106,6 +108,7 @@ class Session:
         self._check_course(request)
         if request.stored:
             self._check_capacity(count)
+        self._check_states(request.states)
         cameras = self._engine.policy.embodiment.camera_names
         self._check_sizes("observation", {name: request.views[name] for name in cameras})
         self.intact = False
@@ -203,6 +206,10 @@ class Session:
                 f"An episode of {total} frames: this server remembers at most {most}"
                 " (limits.frames). Reset between episodes."
             )
+
+    def _check_states(self, states: np.ndarray) -> None:
+        stats = self._engine.policy.require_processor().stats
+        check_reach(states, None if stats is None else stats.state, "a state")
 
     def _check_sizes(self, kind: str, views: Mapping[str, Sequence[np.ndarray]]) -> None:
         """Make sure that a camera's images have the size that they had when the episode began.

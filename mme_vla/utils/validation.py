@@ -159,7 +159,7 @@ def _place(root: _Schema, path: Iterable[int | str], where: str) -> tuple[str, _
         inner = [one for one in inner if isinstance(one, Mapping)]
         if isinstance(part, int):
             key += f"[{part}]"
-        elif inner:
+        elif inner or "properties" in schema:  # a key, also by a second name of it
             name = brief(part, quote=False)
             key = f"{key}.{name}" if key else name
         else:

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief
+from mme_vla.embodiment import ActionSpace
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.sections import PolicySections
@@ -121,10 +122,31 @@ def check_target(policy: Policy, fmt: str) -> None:
             f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's"
             " parameters."
         )
+    if fmt == "lerobot":
+        _check_names(policy.embodiment.action)
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
     if fmt in method_formats():
         method_formats()[fmt].function("adapter")(policy)
+
+
+def _check_names(action: ActionSpace) -> None:
+    """Refuse names by which LeRobot, which searches each of the absolute numbers' in all names,
+    takes other numbers for absolute.
+    """
+    searched = [name.lower() for name in _absolute(action) if name]
+    for i, name in enumerate(action.names):
+        is_absolute = any(text in name.lower() for text in searched)
+        require(
+            not action.relative or is_absolute == (i not in action.relative),
+            f"LeRobot tells absolute actions by parts of names ({listed(searched)}), and would"
+            f" mistake number {i}, {name!r}: choose embodiment.action.names in which no absolute"
+            " number's name is part of a relative one's.",
+        )
+
+
+def _absolute(action: ActionSpace) -> list[str]:
+    return [name for i, name in enumerate(action.names) if i not in action.relative]
 
 
 def write_native(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
@@ -147,10 +169,8 @@ def write_lerobot(
     robot = policy.embodiment
     features: dict[str, Any] = {}
     for camera in robot.cameras:
-        view = camera.key or camera.name
-        features[f"observation.images.{view}"] = {"type": "VISUAL", "shape": [3, size, size]}
+        features[camera.lerobot_key] = {"type": "VISUAL", "shape": [3, size, size]}
     features["observation.state"] = {"type": "STATE", "shape": [robot.state.width]}
-    absolute = [name for i, name in enumerate(robot.action.names) if i not in robot.action.relative]
     about = {
         "type": "pi05",
         "n_obs_steps": 1,
@@ -165,7 +185,7 @@ def write_lerobot(
         "image_resolution": [size, size],
         # Of RoboMME's Panda: joints against the current state, the gripper as it is.
         "use_relative_actions": bool(robot.action.relative),
-        "relative_exclude_joints": absolute,
+        "relative_exclude_joints": _absolute(robot.action),
     }
     write_json(folder / "config.json", about)
     reason = write_pipelines(policy, folder, about, stats)

@@ -25,6 +25,7 @@ from mme_vla.cli.inspect import (
 from mme_vla.cli.inspect_checkpoint import show_checkpoint
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose, resolved
+from mme_vla.data import cache_building
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.recording import Recording, action_offset_of
 from mme_vla.policy.saving import save_policy
@@ -104,6 +105,24 @@ def test_a_checkpoint_without_memory_has_none_to_render(tmp_path: Path) -> None:
         main(compose("inspect", words))
     with pytest.raises(UserError, match="has no memory"):
         main(compose("inspect", [*words, "episode=0"]))
+
+
+def test_images_that_the_default_memory_cannot_divide_say_which_to_choose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = EpisodeSource.frames
+    cropped = lambda *arguments: frames(*arguments)[:, :94, :130]  # noqa: E731
+    monkeypatch.setattr(EpisodeSource, "frames", cropped)
+    words = ["dataset=sample", "episode=0", "step=20", f"output={tmp_path}"]
+    main(compose("inspect", words))
+    printed = capsys.readouterr().out
+    assert "image: none of memory=tokendrop, the default. A 94×130 frame does not" in printed
+    assert "multiples of 8, set memory.grid=2, or choose" in printed
+    main(compose("inspect", [*words, "memory=framesamp"]))
+    assert "framesamp.png" in capsys.readouterr().out
+    memory = build_memory(Inspection.from_config(resolved(compose("inspect"))))
+    with pytest.raises(UserError, match=r"sample, image \(the camera 'front'\): A 94×130 frame"):
+        list(cache_building._chunks(EpisodeSource("sample"), [0], memory, 32))
 
 
 def test_the_tokens_that_are_read_are_counted_against_the_most_that_can_be(

@@ -15,6 +15,7 @@ import torch
 
 from helpers.plugins import plugin
 from mme_vla import Policy
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.errors import UserError
 from mme_vla.testing.small import small_policy
@@ -261,6 +262,31 @@ def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: 
     policy.reset()
     exact = policy.predict_action_chunk(batch, inference_delay=4, prev_chunk_left_over=left)
     assert torch.equal(bound, exact)
+
+
+def test_statistics_and_steps_are_of_the_episodes_that_lerobot_trains_on(
+    package: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from lerobot.datasets import LeRobotDataset
+    from lerobot_policy_mme_vla.samples import Samples
+
+    part = LeRobotDataset("local/sample", root=SAMPLE, episodes=[1, 3])
+    full = LeRobotDataset("local/sample", root=SAMPLE)
+    config = package.MMEVLAConfig(model="pi05", cache_root=str(tmp_path))
+    printed, stats = [], []
+    for dataset in (full, part):
+        model = small_policy("pi05")
+        model.require_processor().stats = None
+        samples = Samples(model, config, dataset.meta)
+        rows = [dataset[0]["index"], torch.tensor(900)]  # the second is of episode 3
+        assert len(samples.batch(torch.stack(rows)).actions) == 2
+        stats.append(model.require_processor().require_stats().state)
+        printed.append(capsys.readouterr().out)
+    assert "in 4 episodes, 0 held-out steps in 0" in printed[0]
+    assert "in 2 episodes" in printed[1] and "held-out steps in 2" in printed[1]
+    assert not np.array_equal(stats[0].mean, stats[1].mean)
+    # `eval_split` computes the loss of held-out episodes too
+    assert len(samples.batch(torch.tensor([100])).actions) == 1
 
 
 def test_an_episode_that_ends_in_an_error_says_why(package: ModuleType) -> None:

@@ -11,7 +11,6 @@ from mme_vla.envs.base import environment
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.serving.client import Client
-from mme_vla.serving.requests import IMAGE_KEYS
 
 SMALL = (
     "backbone.depth=1",
@@ -87,7 +86,7 @@ def served_chunk(
     for name in robot.camera_names:
         if callable(observation[name]):  # rendered on demand
             observation[name] = observation[name]()
-        now[IMAGE_KEYS.get(name, f"observation/{name}")] = observation[name]
+        now[f"observation/{name}"] = observation[name]
     scene.close()
     frames = [*info.get("video", ()), observation]
     with (

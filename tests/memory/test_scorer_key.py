@@ -7,7 +7,8 @@ import pytest
 
 from mme_vla.errors import UserError
 from mme_vla.memory.base import check_scorer
-from mme_vla.memory.history import FrameScorer
+from mme_vla.memory.history import FrameScorer, score_frame
+from mme_vla.memory.joined import _Upsampled
 from mme_vla.memory.tokendrop import ChangeScorer, TokenDrop
 
 
@@ -53,6 +54,17 @@ class OtherTokenDrop(TokenDrop):
 
     def make_scorer(self) -> OtherRule:
         return OtherRule(self.storage.grid, self.stride)
+
+
+@pytest.mark.parametrize(("sides", "grid"), [((94, 130), 2), ((95, 128), 1), ((100, 64), 4)])
+def test_an_image_that_does_not_divide_says_what_would_fit(
+    sides: tuple[int, int], grid: int
+) -> None:
+    image = np.zeros((*sides, 3), np.uint8)
+    for scorer in (ChangeScorer(8, 4), _Upsampled(ChangeScorer(8, 4), 8, 16)):
+        with pytest.raises(UserError, match=f"multiples of 8, set memory.grid={grid}, or"):
+            score_frame(scorer, 3, image)
+    score_frame(ChangeScorer(grid, 4), 3, image)
 
 
 def test_scores_under_the_key_of_another_rule_are_refused() -> None:

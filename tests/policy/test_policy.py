@@ -293,6 +293,16 @@ def test_an_episode_keeps_what_its_caller_writes_over():
     assert (chunks[0] == chunks[1]).all()
 
 
+def test_past_states_out_of_range_are_refused_as_current_ones_are(remembering):
+    episode = remembering.start_episode("press the button")
+    frames = moving_frames(4, size=remembering.backbone.image_size)
+    states = np.zeros((4, 8), np.float32)
+    states[1, 2] = 5000
+    with pytest.raises(UserError, match="5000 for number 3 of 8"):
+        episode.add_frames(frames, states=states)
+    assert episode.n_observed_frames == 0
+
+
 @pytest.mark.parametrize(
     ("rendered", "says"),
     [

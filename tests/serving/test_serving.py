@@ -242,14 +242,33 @@ def test_a_refused_request_leaves_the_episode_as_it_was(policy):
         with served.client() as client:
             first = by_challenge(client, parts[:1])
             small = tuple(images[:, :32] for images in parts[1][:2])
+            broken = challenge(*parts[1], first=False)
+            broken["joint_state_list"] = [*broken["joint_state_list"][:-1], np.full(7, 1e6)]
             for message, reason in (
                 ({"front_rgb_list": 3}, "task_goal"),
+                (broken, "Check the driver and the units."),
                 (challenge(*small, *parts[1][2:], first=False), "had [64, 64] before"),
             ):
                 with pytest.raises(UserError, match=re.escape(reason)):
                     client.request(message)
             second = client.request(challenge(*parts[1], first=False))["actions"]
         np.testing.assert_array_equal(np.concatenate([*first, second]), np.concatenate(expected))
+
+
+def test_a_state_out_of_range_costs_neither_buffer_nor_episode(policy):
+    front, wrist, state = course()[0]
+    broken = state.copy()
+    broken[3] = 1e6
+    with Served(policy) as served, served.client() as client:
+        (expected,) = by_buffer(client, course()[:1])
+        client.reset()
+        with pytest.raises(UserError, match="1e\\+06 for number 1 of 8"):
+            client.add_buffer(front, broken, exec_start=2)
+        client.add_buffer(front, state, exec_start=len(front) - 1)
+        with pytest.raises(UserError, match="1e\\+06 for number 1 of 8"):
+            client.infer(observation(front[-1], wrist[-1], broken[3]))
+        chunk = client.infer(observation(front[-1], wrist[-1], state[-1]))["actions"]
+    np.testing.assert_array_equal(chunk, expected)
 
 
 def test_a_request_that_failed_half_way_ends_its_connection(policy):

@@ -11,7 +11,14 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
 from mme_vla.serving import pack, unpack
 from mme_vla.serving.codec import check_size
-from mme_vla.serving.requests import AddBuffer, Infer, Request, RequestReader, Reset
+from mme_vla.serving.requests import (
+    AddBuffer,
+    Infer,
+    Request,
+    RequestReader,
+    Reset,
+    released_keys,
+)
 
 ARRAY = np.array([[1, -2], [300, 4]], np.int16)
 ARRAY_BYTES = (
@@ -302,5 +309,36 @@ def test_keys_of_another_library_are_answered_with_those_of_the_robot():
     assert "observation/image" not in str(error.value)
     with pytest.raises(UserError, match=r"observation/head, … or head_rgb_list"):
         reader.parse({"reset": False})
-    with pytest.raises(UserError, match=r"observation/image, … or front_rgb_list"):
+    with pytest.raises(UserError, match=r"observation/front, … or front_rgb_list"):
         parse({"reset": False})
+
+
+WHITE = np.full_like(IMAGE, 255)
+
+
+@pytest.mark.parametrize("key", ["observation/front", "observation/image"])
+def test_a_camera_has_the_key_of_its_name_and_the_released_one(key):
+    sent = {"observation/state": states(1)[0], "prompt": GOAL, "observation/wrist": IMAGE}
+    assert parse({**sent, key: WHITE}).views["front"].min() == 255
+    with pytest.raises(UserError, match=f"{key} must be a uint8 image"):
+        parse({**sent, key: WHITE.astype(np.float32)})
+    both = {"observation/front": WHITE, "observation/image": WHITE}
+    with pytest.raises(UserError, match="both images of the camera 'front': send one"):
+        parse({**sent, **both})
+
+
+def test_the_released_key_is_the_cameras_that_is_called_so():
+    arm = {
+        "name": "arm",
+        "cameras": {"front": {}, "image": {}, "wrist": {}},
+        "state": {"width": 2},
+        "action": {"width": 2},
+    }
+    robot = Embodiment.from_dict(arm)
+    assert released_keys(robot) == {"wrist": "observation/wrist_image"}
+    sent = {"observation/state": np.zeros(2), "prompt": GOAL, "observation/wrist_image": IMAGE}
+    sent["observation/image"] = WHITE
+    with pytest.raises(UserError, match="lacks the key 'observation/front'"):
+        RequestReader(robot, 10).parse(sent)
+    views = RequestReader(robot, 10).parse({**sent, "observation/front": IMAGE}).views
+    assert views["image"].min() == 255 and views["front"].max() == 0

@@ -13,13 +13,16 @@ import torch
 from safetensors.torch import save_file
 
 from helpers.lerobot_pi05 import reduce_sizes
+from mme_vla import build_policy
 from mme_vla.cli.weights import convert
+from mme_vla.embodiment import ActionSpace
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.tokenizer import PALIGEMMA, Tokenizer
 from mme_vla.testing.small import moving_frames, small_policy
 from mme_vla.weights.load import load_weights, transfer
 from mme_vla.weights.ports import to_lerobot
+from mme_vla.weights.writers import check_target
 
 GOAL = "pick up the red cube"
 
@@ -115,6 +118,63 @@ def test_what_lerobot_has_no_step_for_is_reported(
         convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
     assert not (tmp_path / "lerobot/policy_preprocessor.json").exists()
     assert json.loads((tmp_path / "lerobot/config.json").read_text())["type"] == "pi05"
+
+
+ARM = """
+name: arm
+cameras:
+  head: {key: observation.images.head-cam_A}
+  hand: {key: hand-cam}
+state: {width: 4}
+action: {width: 4, names: [lift, reach, twist, grip], relative: [0, 1, 2], horizon: 20}
+"""
+
+
+def test_a_camera_keeps_the_name_of_its_column(tmp_path: Path) -> None:
+    (tmp_path / "embodiment").mkdir()
+    (tmp_path / "embodiment/arm.yaml").write_text(ARM)
+    policy = build_policy("pi05", config_dir=tmp_path, embodiment="arm")
+    policy.save_pretrained(tmp_path / "ours")
+    with pytest.warns(UserWarning, match="no normalisation statistics"):
+        convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
+    about = json.loads((tmp_path / "lerobot/config.json").read_text())
+    assert list(about["input_features"]) == [
+        "observation.images.head-cam_A",
+        "observation.images.hand-cam",
+        "observation.state",
+    ]
+    assert about["relative_exclude_joints"] == ["grip"]
+
+
+@pytest.mark.parametrize(
+    ("names", "relative", "mistaken"),
+    [
+        (["lift", "lift_gripper", "twist", "arm"], (1, 2, 3), "number 1, 'lift_gripper'"),
+        (["LIFT", "twist_lift", "arm"], (1, 2), "number 1, 'twist_lift'"),
+        (["lift", "lift_gripper", "arm"], (0, 2), None),
+        ([f"number {i + 1}" for i in range(14)], tuple(range(1, 14)), "number 9, 'number 10'"),
+        ([f"number {i + 1}" for i in range(14)], tuple(range(13)), None),
+        (["lift", ""], (0,), "number 1, ''"),
+        (["lift", "lift_gripper"], (0, 1), None),
+        (["lift", "lift_gripper"], (), None),
+    ],
+)
+def test_names_by_which_lerobot_mistakes_numbers_are_refused(
+    names: list[str], relative: tuple[int, ...], mistaken: str | None
+) -> None:
+    from lerobot.processor import RelativeActionsProcessorStep
+
+    action = ActionSpace(width=len(names), names=tuple(names), relative=relative)
+    policy: Any = SimpleNamespace(memory=None, embodiment=SimpleNamespace(action=action))
+    absolute = [name for i, name in enumerate(names) if i not in relative]
+    mask = RelativeActionsProcessorStep(True, absolute, names)._build_mask(len(names))
+    is_mistaken = bool(relative) and mask != [i in relative for i in range(len(names))]
+    assert is_mistaken == (mistaken is not None)
+    if mistaken is None:
+        check_target(policy, "lerobot")
+    else:
+        with pytest.raises(UserError, match=rf"{mistaken}.*embodiment\.action\.names"):
+            check_target(policy, "lerobot")
 
 
 @pytest.mark.parametrize("setting", ["use_visual_memory", "use_proprioceptive_memory"])

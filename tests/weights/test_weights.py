@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 from helpers.memory_fakes import same
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.cli.weights import convert
+from mme_vla.cli.weights import convert, main
 from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
 from mme_vla.weights import (
     detect_format,
@@ -171,6 +171,21 @@ def test_a_dry_run_prints_the_mapping_and_makes_no_folder(
             assert f"\n{side}, {heading}" in printed
     assert re.search(r"\n  \S*action_in_proj.weight \[\S+\] → backbone.action_in.weight,", printed)
     assert re.search(r"\n  \S+layers\.\*\S+ \[\S+\] → \S+layers\.\*\S+, \d+ tensors\n", printed)
+
+
+def test_a_robot_comes_from_a_folder_of_yaml_files(
+    bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "embodiment").mkdir()
+    (tmp_path / "embodiment/arm.yaml").write_text(
+        "name: arm\ncameras: {head: {}}\nstate: {width: 8}\naction: {width: 8, horizon: 20}\n"
+    )
+    words = [str(bases["openpi"]), str(tmp_path / "arm"), "backbone=tiny", "embodiment=arm"]
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "--config-dir DIR" in capsys.readouterr().err
+    main([*words, "--config-dir", str(tmp_path)])
+    assert MMEPolicy.from_pretrained(tmp_path / "arm").embodiment.camera_names == ("head",)
 
 
 def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from mme_vla.serving.remote.connections import (
     open_patiently,
 )
 from mme_vla.serving.remote.settings import ServerChoice, Subgoals
-from mme_vla.serving.requests import IMAGE_KEYS
+from mme_vla.serving.requests import released_keys
 
 SERVER_NAME = "mme_vla"  # what this library's server calls itself
 LONGEST_CHUNK = 4096  # actions
@@ -158,9 +158,10 @@ class ServerProtocol:
     def observation(self, frames: NewFrames) -> dict[str, Any]:
         """The current frame as openpi's servers read it."""
         keys = self.choice.connection.keys
+        released = released_keys(self.robot)
         message: dict[str, Any] = {}
         for name in self.robot.camera_names:
-            key = IMAGE_KEYS.get(name, f"observation/{name}")
+            key = released.get(name, f"observation/{name}")
             message[keys.get(name, key)] = np.ascontiguousarray(frames.current[name])
         message[keys.get("state", "observation/state")] = frames.state
         message[keys.get("prompt", "prompt")] = frames.goal

@@ -117,8 +117,9 @@ def image_key(camera: Camera, features: Collection[str]) -> str:
     Raises:
         UserError: there is neither.
     """
-    names = [f"observation.images.{name}" for name in (camera.key, camera.name) if name]
-    for name in (camera.key, *names):
+    names = list(dict.fromkeys([camera.lerobot_key, f"observation.images.{camera.name}"]))
+    doubled = f"observation.images.{camera.key}"  # of earlier folders of this plugin
+    for name in (camera.key, *names, doubled):
         if name in features:
             return str(name)
     raise UserError(

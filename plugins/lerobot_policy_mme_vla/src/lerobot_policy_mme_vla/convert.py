@@ -35,9 +35,7 @@ def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:
 def features_of(robot: Embodiment) -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
     """The features that LeRobot lists for a robot's policy; images may have any size."""
     image_features = {
-        f"observation.images.{camera.key or camera.name}": PolicyFeature(
-            FeatureType.VISUAL, (3, SIDE, SIDE)
-        )
+        camera.lerobot_key: PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE))
         for camera in robot.cameras
     }
     state = PolicyFeature(FeatureType.STATE, (robot.state.width,))
