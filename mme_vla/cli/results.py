@@ -118,6 +118,13 @@ def verify(args: argparse.Namespace) -> None:
         lines += [f"note: {line}" for line in result.notes]
         for line in lines:
             print(f"  {printable(line)}")
+    # Results read these as well.
+    below = [*args.receipt.rglob("episodes*.jsonl"), *args.receipt.rglob("episodes*.jsonl.xz")]
+    for path in sorted(below):
+        if not any(path.parent.glob("receipt*.json")):
+            words.add("not compared")
+            print(printable(f"{path}: not compared"))
+            print("  not compared: records: no receipt is beside them.")
     if "differs" in words:
         raise SystemExit(DIFFERS)
     if "not compared" in words:

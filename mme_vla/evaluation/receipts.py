@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
-from pydantic import StrictInt
+from pydantic import StrictBool, StrictInt
 
 from mme_vla.config.naming import digest, flat
 from mme_vla.envs.base import environment
@@ -120,6 +120,7 @@ class _Receipt(TypedDict):
     conditions: list[_Conditions]
     records: dict[str, str | None]
     scenes: NotRequired[str]
+    ended: NotRequired[StrictBool]
     score: dict[str, Any]
 
 
@@ -209,18 +210,18 @@ def receipt(
         "conditions": conditions,
     }
 
-    def write() -> None:
+    def write(ended: bool) -> None:
         done = read_records(records) if records.exists() else []
         score = _score(records, done, run["settings"])
-        write_json(path, with_checksum(to_json(facts | score)))
+        write_json(path, with_checksum(to_json(facts | score | {"ended": ended})))
 
-    write()  # before as well: a process that is killed has named its conditions
+    write(ended=False)  # a process that is killed has named its conditions
     try:
         yield
     finally:
         if policy.info.server is not None:
             here["server"] = dict(policy.info.server)  # its times are known now
-        write()
+        write(ended=True)
 
 
 def read_receipt(path: Path) -> dict[str, Any]:
@@ -256,20 +257,29 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
     else:
         result.not_compared.append(f"settings: {RUN_FILE} is not beside the receipt.")
 
+    folder = path.parent
+    names = {content["records"].get("file")}
+    names |= {read_receipt(other)["records"].get("file") for other in folder.glob("receipt*.json")}
+    for file in sorted([*folder.glob("episodes*.jsonl"), *folder.glob("episodes*.jsonl.xz")]):
+        if file.name.removesuffix(".xz") not in names:
+            result.not_compared.append(f"records: no receipt names {file.name}.")
     name = content["records"].get("file")
     if name is None:
         result.not_compared.append("records: the receipt names no file of them.")
     else:
-        # The records may have been compressed since.
-        files = [inside(path.parent, end, "records") for end in (name, f"{name}.xz")]
+        # The records may have been compressed since. Results read both files where there are two.
+        files = [inside(folder, end, "records") for end in (name, f"{name}.xz")]
         present = [file for file in files if file.is_file()]
         if not present:
             missing = f"records: neither {name} nor {name}.xz is beside the receipt."
             result.differences.append(missing)
-        for file in present[:1]:
+        for file in present:
             records = read_records(file)
             for key, value in to_json(_score(file, records, content["settings"])).items():
-                if key == "scenes" and key not in content:
+                if not content.get("ended", True):
+                    unwritten = "records: their process was killed before it wrote their score."
+                    result.not_compared.append(unwritten)
+                elif key == "scenes" and key not in content:
                     result.not_compared.append("scenes: the receipt does not name them.")
                 elif key != "score" or content["score"] != _outcomes(records):
                     # Receipts of earlier versions count every try of an episode.

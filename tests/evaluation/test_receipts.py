@@ -339,6 +339,65 @@ def test_episodes_whose_scene_is_not_named_are_not_compared(
     assert result.word == "not compared" and reason in result.not_compared[0]
 
 
+def verified_by_command(path: Path, *options: str) -> int:
+    """Exit code of the command."""
+    try:
+        main(["verify", str(path), *options])
+    except SystemExit as ended:
+        return int(str(ended.code))
+    return 0
+
+
+@pytest.mark.parametrize("name", ["episodes-1of2.jsonl", "episodes-1of2.jsonl.xz"])
+def test_records_that_no_receipt_names_are_not_compared(
+    name: str, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    further = finished.with_name(name)
+    shutil.copy(finished.with_name("episodes.jsonl"), further)
+    line = f"records: no receipt names {name}."
+    assert receipts.verify(finished) == ([], [line], [])
+    # a receipt of the same name that is of the other file
+    shutil.copy(finished, receipts.receipt_file(further))
+    assert receipts.verify(finished) == ([], [line], [])
+    below = finished.parent / "below"
+    below.mkdir()
+    further.rename(below / name)
+    assert receipts.verify(finished).word == "agrees"
+    assert verified_by_command(finished.parent) == 3
+    assert f"{below / name}: not compared" in capsys.readouterr().out
+
+
+def test_records_and_others_under_the_same_name_compressed_are_both_compared(
+    finished: Path,
+) -> None:
+    records = finished.with_name("episodes.jsonl")
+    packed = finished.with_name("episodes.jsonl.xz")
+    packed.write_bytes(lzma.compress(records.read_bytes()))
+    assert receipts.verify(finished).word == "agrees"
+    forged = EpisodeRecord.from_json(records.read_text())
+    packed.write_bytes(lzma.compress(replace(forged, outcome="success").to_json().encode() + b"\n"))
+    assert receipts.verify(finished).word == "differs"
+
+
+def test_a_receipt_of_a_killed_process_is_not_compared_with_its_records(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, files = receipts.write_json, []
+    monkeypatch.setattr(receipts, "write_json", lambda *file: files.append(file))
+    path = run(tmp_path, checkpoint, range(1))
+    begun, ended = files
+    write(*begun)  # all that a killed process writes
+    line = "records: their process was killed before it wrote their score."
+    assert receipts.verify(path) == ([], [line], [])
+    write(*ended)
+    assert receipts.verify(path).word == "agrees"
+    write(*begun)
+    records = tmp_path / "episodes.jsonl"
+    other = replace(EpisodeRecord.from_json(records.read_text()), max_steps=9)
+    records.write_text(other.to_json() + "\n")
+    assert receipts.verify(path).word == "differs", "the settings are compared as of any other"
+
+
 def test_tasks_that_are_not_here_are_not_compared(finished: Path) -> None:
     rewrite_records(finished, task="NoTaskOfThisName")
     result = receipts.verify(finished)
