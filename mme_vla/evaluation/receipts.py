@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, NotRequired, TypedDict
 from pydantic import StrictBool, StrictInt
 
 from mme_vla.config.naming import digest, flat
+from mme_vla.config.plugins import import_trusted
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
@@ -238,13 +239,16 @@ def read_receipt(path: Path) -> dict[str, Any]:
     return content
 
 
-def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Verification:
+def verify(
+    path: Path, checkpoint: Path | None = None, build: bool = True, trust_plugins: bool = False
+) -> Verification:
     """Check a receipt offline: compare it with the files and the versions that are here.
 
     Args:
         path: of the receipt; its records, or these as `.xz`, and `run.json` are beside it.
         checkpoint: where the checkpoint is, if not at the place that the receipt names.
         build: whether the scenes are built here, without images, and compared: about 0.1 s a scene.
+        trust_plugins: import the parts of installed packages that receipt and records name.
 
     Raises:
         UserError: the file is no receipt, or a name in it leads outside of the folder that it is
@@ -284,8 +288,8 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
                 elif key != "score" or content["score"] != _outcomes(records):
                     # Receipts of earlier versions count every try of an episode.
                     result.compare(key, content.get(key, {}), value)
-            _compare_records(result, records, content)
-            _compare_scenes(result, records, content, build)
+            _compare_records(result, records, content, trust_plugins)
+            _compare_scenes(result, records, content, build, trust_plugins)
 
     for part in content["conditions"] or [{}]:
         _compare_conditions(result, part, checkpoint)
@@ -335,7 +339,10 @@ def _outcomes(records: Sequence[EpisodeRecord]) -> dict[str, Mapping[str, int]]:
 
 
 def _compare_records(
-    result: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]
+    result: Verification,
+    records: Sequence[EpisodeRecord],
+    content: Mapping[str, Any],
+    trust_plugins: bool,
 ) -> None:
     """Whether every record is of the settings and of the training, and no longer than its limit."""
     settings = content["settings"]
@@ -357,6 +364,8 @@ def _compare_records(
     limit = settings.get("max_steps", float("inf")) + _MARGIN
     try:
         # The time for which events hold the robot counts as well.
+        words = re.split("[:@+]", str(expected["event"]))
+        import_trusted({"event": words}, f"event={expected['event']}", trust_plugins)
         limit += sum(event.perturbation.hold for event in read_events(expected["event"]))
     except UserError as error:
         limit = float("inf")
@@ -382,12 +391,16 @@ def _compare_scenes(
     records: Sequence[EpisodeRecord],
     content: Mapping[str, Any],
     build: bool,
+    trust_plugins: bool,
 ) -> None:
     """Seeds and difficulties of the episodes, and the scenes' digests, for which they are built."""
     if not records:
         result.not_compared.append("scenes: there is no record.")
     try:
-        env = environment(str(content["settings"].get("env")))
+        source = str(content["settings"].get("env"))
+        parts = {"env": source, "tasks": [record.task for record in records]}
+        import_trusted(parts, f"env={source}", trust_plugins)
+        env = environment(source)
         # A try that ended before its scene was built does not count beside one that names it.
         named = {record.key for record in records if record.named_scene is not None}
         for record in records:

@@ -5,7 +5,8 @@ import lzma
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ pytest.importorskip("mani_skill", reason="scenes are built, which needs the extr
 
 from helpers.nano_policies import nano
 from helpers.rollout_fakes import quick_policy
-from mme_vla import UserError
+from mme_vla import UserError, registry
 from mme_vla.cli.results import main
+from mme_vla.config import plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.evaluation import receipts
@@ -210,6 +212,47 @@ def test_scenes_of_an_environment_that_is_not_here_are_not_compared(
     result = receipts.verify(path)
     assert not result.differences and result.word == "not compared"
     assert any(line.startswith("scenes: ") for line in result.not_compared)
+
+
+@pytest.fixture
+def of_a_plugin(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of a run in an environment of the module `foreign_env`, which lies there."""
+    for path in (finished, finished.with_name("run.json")):
+        rewrite(path, lambda content: content["settings"].update(env="of_a_plugin"))
+    (tmp_path / "foreign_env.py").write_text(
+        "from mme_vla.envs.benchmark import RoboMME\nfrom mme_vla.registry import ENVS\n\n\n"
+        "@ENVS.register('of_a_plugin')\nclass Foreign(RoboMME):\n    pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(plugins, "_imported", {})
+    monkeypatch.setattr(registry.ENVS, "_entries", dict(registry.ENVS._entries))
+    yield tmp_path
+    sys.modules.pop("foreign_env", None)
+
+
+def test_an_environment_of_a_plugin_is_verified_with_its_module(of_a_plugin: Path) -> None:
+    assert verified_by_command(of_a_plugin) == 3
+    assert verified_by_command(of_a_plugin, "--trust-plugins") == 3, "the receipt names no module"
+    assert "foreign_env" not in sys.modules
+    assert verified_by_command(of_a_plugin, "--plugins", "foreign_env") == 0
+
+
+@pytest.mark.parametrize("option", ["--trust-plugins", "trust_plugins=true"])
+def test_installed_code_that_a_receipt_names_needs_trust(
+    option: str,
+    of_a_plugin: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    extension = registry.Extension(parts={"env": {"of_a_plugin": "foreign_env"}})
+    for module in (plugins, registry):
+        monkeypatch.setattr(module, "installed_extensions", lambda: (extension,))
+    monkeypatch.syspath_prepend(of_a_plugin)
+    assert verified_by_command(of_a_plugin) == 3
+    assert "scenes: env=of_a_plugin needs the plugin foreign_env" in capsys.readouterr().out
+    assert "foreign_env" not in sys.modules
+    assert verified_by_command(of_a_plugin, option) == 0
 
 
 def test_a_receipt_is_named_after_its_records_packed_or_not() -> None:
