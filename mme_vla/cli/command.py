@@ -33,7 +33,7 @@ from mme_vla.config.composition import (
     parse,
     resolved,
 )
-from mme_vla.config.naming import join_memories, several_memories
+from mme_vla.config.naming import expand_overrides, join_memories
 from mme_vla.config.override_errors import Names, badly_spaced, bare_word, paths, unknown_option
 from mme_vla.config.plugins import TRUST_FLAG
 from mme_vla.config.trees import config_dir, library_trees
@@ -59,7 +59,7 @@ def run_configured(
         check: `module:function` that is given the plain configuration before `main` is called.
     """
     tree = directory or config_dir()
-    words = several_memories(plugins.trust_as_override(sys.argv[1:]))
+    words = expand_overrides(plugins.trust_as_override(sys.argv[1:]))
 
     @functools.wraps(main)  # Hydra names the job after the module
     def job(cfg: DictConfig) -> object:

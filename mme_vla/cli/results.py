@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
+from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.envs.episodes import ALL, GRAMMAR, check_episodes, choose_numbers, read_episodes
 from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, counted, printable, require
@@ -76,6 +77,7 @@ EXAMPLES = (
 VERIFY_EXAMPLES = (
     "outputs/evaluation/framesamp_modul/80000/seed42",
     "receipt.json --checkpoint downloads/step_080000",
+    "outputs/blink --plugins blink",
 )
 
 
@@ -86,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Read, aggregate, compare, print, write; or check receipts."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["verify"]:
-        command, args = verify, _verify_parser().parse_args(words[1:])
+        command, args = verify, _verify_parser().parse_args(trust_as_flag(words[1:]))
     else:
         command, args = run, _parser().parse_intermixed_args(words)
     with print_user_errors():
@@ -100,6 +102,7 @@ def verify(args: argparse.Namespace) -> None:
     """
     from mme_vla.evaluation import receipts
 
+    import_plugins(args.plugins)
     paths = sorted(args.receipt.rglob("receipt*.json"))
     if args.receipt.is_file():
         paths = [args.receipt]
@@ -110,7 +113,7 @@ def verify(args: argparse.Namespace) -> None:
     )
     words = set()
     for path in paths:
-        result = receipts.verify(path, args.checkpoint, not args.no_scenes)
+        result = receipts.verify(path, args.checkpoint, not args.no_scenes, args.trust_plugins)
         words.add(result.word)
         print(f"{path}: {result.word}")
         lines = list(result.differences)
@@ -118,6 +121,13 @@ def verify(args: argparse.Namespace) -> None:
         lines += [f"note: {line}" for line in result.notes]
         for line in lines:
             print(f"  {printable(line)}")
+    # Results read these as well.
+    below = [*args.receipt.rglob("episodes*.jsonl"), *args.receipt.rglob("episodes*.jsonl.xz")]
+    for path in sorted(below):
+        if not any(path.parent.glob("receipt*.json")):
+            words.add("not compared")
+            print(printable(f"{path}: not compared"))
+            print("  not compared: records: no receipt is beside them.")
     if "differs" in words:
         raise SystemExit(DIFFERS)
     if "not compared" in words:
@@ -417,6 +427,18 @@ def _verify_parser() -> argparse.ArgumentParser:
         "--no-scenes",
         action="store_true",
         help="do not build the scenes here (0.1 s each); they count as not compared",
+    )
+    parser.add_argument(
+        "--plugins",
+        nargs="+",
+        default=[],
+        metavar="MODULE",
+        help="your own modules, of the environment for example, imported first",
+    )
+    parser.add_argument(
+        TRUST_FLAG,
+        action="store_true",
+        help="import what receipts name of installed packages: their code",
     )
     return parser
 

@@ -28,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from mme_vla.config import plugins
-from mme_vla.config.naming import join_memories, several_memories
+from mme_vla.config.naming import expand_overrides, join_memories
 from mme_vla.config.override_errors import (
     COMPOSITION_ERRORS,
     FORMS,
@@ -134,7 +134,7 @@ def compose(
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
     for folder in trees:
         require(folder.is_dir(), f"The config folder {str(folder)!r} does not exist.")
-    words = several_memories(overrides)
+    words = expand_overrides(overrides)
     with local_hydra(trees[0], trees[1:]) as engine:
         tree = ConfigTree(engine.config_loader, config_name, parse(words))
         try:

@@ -13,6 +13,8 @@ JOINED = "joined"
 DEFAULT_BUDGET = 512
 """Memory tokens of a policy that sets no budget, as in the paper."""
 
+_UNQUOTED = re.compile(r"[\w:=,./-]+")  # no quote or bracket; with the commas of a sweep
+_DIAL = re.compile(r"[\w:]+:\w+=\d+")
 _SEVERAL = re.compile(r"/?memory=(\[.*\])")
 
 
@@ -40,17 +42,22 @@ def literal(value: Any) -> str:
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
-def several_memories(overrides: Iterable[str]) -> list[str]:
-    """Overrides in which `memory=[framesamp,ttt]` is written out: the memory `joined` with these
-    members.
+def expand_overrides(overrides: Iterable[str]) -> list[str]:
+    """Overrides as Hydra reads them.
 
-    Hydra itself would lay the two files over each other.
+    `memory=[framesamp,ttt]` is written out as the memory `joined` with these members: Hydra itself
+    would lay the two files over each other. The value of `split=stress:count=2` is quoted, since it
+    has a `=`.
     """
     result: list[str] = []
     for word in overrides:
         several = _SEVERAL.fullmatch(word)
+        key, _, value = word.partition("=")
         if several:
             result += [f"memory={JOINED}", f"memory.members={several[1]}"]
+        elif _UNQUOTED.fullmatch(value):
+            quoted = _DIAL.sub(r"'\g<0>'", value)
+            result.append(f"{key}={quoted}")
         else:
             result.append(word)
     return result

@@ -68,10 +68,10 @@ def plugins_of(config: Any, source: str) -> list[str]:
 
 
 def import_trusted(config: Any, source: str, trust: bool) -> None:
-    """Import the plugins that a checkpoint names.
+    """Import the plugins that a checkpoint or a receipt names.
 
-    config: the checkpoint's configuration.
-    source: the checkpoint, for messages.
+    config: the checkpoint's configuration, or what the receipt names.
+    source: the checkpoint or receipt, for messages.
     trust: the user has said that what it names may run here.
     """
     names = plugins_of(config, source)
@@ -89,7 +89,7 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
     strange = [name for name in required if name not in sys.modules]
     require(
         not strange or trust,
-        f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that"
+        f"{source} needs the plugin {listed(strange)}: code that it names and that"
         f" would run on this machine. If you know it and trust it, say so with {TRUST_FLAG} (from"
         " Python trust_plugins=True), and start where the module can be found: in its folder, or"
         " with it installed.",

@@ -129,6 +129,7 @@ def read_variant(split: str) -> Variant | None:
     if str(split).startswith(f"{TWIN}:"):
         base = split.removeprefix(f"{TWIN}:")
         varied = read_variant(base) or Variant(base=base)
+        require(not varied.twin, f"split={split!r}: name {TWIN} once, as {TWIN}:{varied.base}.")
         return replace(varied, twin=True)
     if not str(split).startswith(STRESS):
         return None

@@ -12,9 +12,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
-from pydantic import StrictInt
+from pydantic import StrictBool, StrictInt
 
 from mme_vla.config.naming import digest, flat
+from mme_vla.config.plugins import import_trusted
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
@@ -120,6 +121,7 @@ class _Receipt(TypedDict):
     conditions: list[_Conditions]
     records: dict[str, str | None]
     scenes: NotRequired[str]
+    ended: NotRequired[StrictBool]
     score: dict[str, Any]
 
 
@@ -209,18 +211,18 @@ def receipt(
         "conditions": conditions,
     }
 
-    def write() -> None:
+    def write(ended: bool) -> None:
         done = read_records(records) if records.exists() else []
         score = _score(records, done, run["settings"])
-        write_json(path, with_checksum(to_json(facts | score)))
+        write_json(path, with_checksum(to_json(facts | score | {"ended": ended})))
 
-    write()  # before as well: a process that is killed has named its conditions
+    write(ended=False)  # a process that is killed has named its conditions
     try:
         yield
     finally:
         if policy.info.server is not None:
             here["server"] = dict(policy.info.server)  # its times are known now
-        write()
+        write(ended=True)
 
 
 def read_receipt(path: Path) -> dict[str, Any]:
@@ -237,13 +239,16 @@ def read_receipt(path: Path) -> dict[str, Any]:
     return content
 
 
-def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Verification:
+def verify(
+    path: Path, checkpoint: Path | None = None, build: bool = True, trust_plugins: bool = False
+) -> Verification:
     """Check a receipt offline: compare it with the files and the versions that are here.
 
     Args:
         path: of the receipt; its records, or these as `.xz`, and `run.json` are beside it.
         checkpoint: where the checkpoint is, if not at the place that the receipt names.
         build: whether the scenes are built here, without images, and compared: about 0.1 s a scene.
+        trust_plugins: import the parts of installed packages that receipt and records name.
 
     Raises:
         UserError: the file is no receipt, or a name in it leads outside of the folder that it is
@@ -256,26 +261,35 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
     else:
         result.not_compared.append(f"settings: {RUN_FILE} is not beside the receipt.")
 
+    folder = path.parent
+    names = {content["records"].get("file")}
+    names |= {read_receipt(other)["records"].get("file") for other in folder.glob("receipt*.json")}
+    for file in sorted([*folder.glob("episodes*.jsonl"), *folder.glob("episodes*.jsonl.xz")]):
+        if file.name.removesuffix(".xz") not in names:
+            result.not_compared.append(f"records: no receipt names {file.name}.")
     name = content["records"].get("file")
     if name is None:
         result.not_compared.append("records: the receipt names no file of them.")
     else:
-        # The records may have been compressed since.
-        files = [inside(path.parent, end, "records") for end in (name, f"{name}.xz")]
+        # The records may have been compressed since. Results read both files where there are two.
+        files = [inside(folder, end, "records") for end in (name, f"{name}.xz")]
         present = [file for file in files if file.is_file()]
         if not present:
             missing = f"records: neither {name} nor {name}.xz is beside the receipt."
             result.differences.append(missing)
-        for file in present[:1]:
+        for file in present:
             records = read_records(file)
             for key, value in to_json(_score(file, records, content["settings"])).items():
-                if key == "scenes" and key not in content:
+                if not content.get("ended", True):
+                    unwritten = "records: their process was killed before it wrote their score."
+                    result.not_compared.append(unwritten)
+                elif key == "scenes" and key not in content:
                     result.not_compared.append("scenes: the receipt does not name them.")
                 elif key != "score" or content["score"] != _outcomes(records):
                     # Receipts of earlier versions count every try of an episode.
                     result.compare(key, content.get(key, {}), value)
-            _compare_records(result, records, content)
-            _compare_scenes(result, records, content, build)
+            _compare_records(result, records, content, trust_plugins)
+            _compare_scenes(result, records, content, build, trust_plugins)
 
     for part in content["conditions"] or [{}]:
         _compare_conditions(result, part, checkpoint)
@@ -325,7 +339,10 @@ def _outcomes(records: Sequence[EpisodeRecord]) -> dict[str, Mapping[str, int]]:
 
 
 def _compare_records(
-    result: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]
+    result: Verification,
+    records: Sequence[EpisodeRecord],
+    content: Mapping[str, Any],
+    trust_plugins: bool,
 ) -> None:
     """Whether every record is of the settings and of the training, and no longer than its limit."""
     settings = content["settings"]
@@ -347,6 +364,8 @@ def _compare_records(
     limit = settings.get("max_steps", float("inf")) + _MARGIN
     try:
         # The time for which events hold the robot counts as well.
+        words = re.split("[:@+]", str(expected["event"]))
+        import_trusted({"event": words}, f"event={expected['event']}", trust_plugins)
         limit += sum(event.perturbation.hold for event in read_events(expected["event"]))
     except UserError as error:
         limit = float("inf")
@@ -372,12 +391,16 @@ def _compare_scenes(
     records: Sequence[EpisodeRecord],
     content: Mapping[str, Any],
     build: bool,
+    trust_plugins: bool,
 ) -> None:
     """Seeds and difficulties of the episodes, and the scenes' digests, for which they are built."""
     if not records:
         result.not_compared.append("scenes: there is no record.")
     try:
-        env = environment(str(content["settings"].get("env")))
+        source = str(content["settings"].get("env"))
+        parts = {"env": source, "tasks": [record.task for record in records]}
+        import_trusted(parts, f"env={source}", trust_plugins)
+        env = environment(source)
         # A try that ended before its scene was built does not count beside one that names it.
         named = {record.key for record in records if record.named_scene is not None}
         for record in records:

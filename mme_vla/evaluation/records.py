@@ -17,7 +17,7 @@ from mme_vla.config.sections import Range, read_section
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
-from mme_vla.errors import UserError, check_choice, require
+from mme_vla.errors import UserError, brief, check_choice, require
 from mme_vla.policy.run_folders import shipped_checkpoints
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import name_place, parse_json, read_lines, to_line, verified
@@ -395,10 +395,23 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             " choose conflicts first or last.",
         )
         # Of records of one second the later in the list is the last.
-        supersedes = new.when >= old.when if conflicts == "last" else new.when < old.when
+        new_ended, old_ended = _ended(new), _ended(old)
+        supersedes = new_ended >= old_ended if conflicts == "last" else new_ended < old_ended
         if supersedes:
             merged[at] = new
     return list(merged.values())
+
+
+def _ended(record: EpisodeRecord) -> datetime:
+    """The time of an episode's end; without an offset it is of UTC."""
+    try:
+        ended = datetime.fromisoformat(record.when)
+    except ValueError:
+        raise UserError(
+            f"{record.task} {record.episode} ({record.run}): when={brief(record.when)} is no time."
+            " Expected ISO 8601, such as 2026-01-31T12:00:00+00:00."
+        ) from None
+    return ended if ended.tzinfo is not None else ended.replace(tzinfo=UTC)
 
 
 def check_settings(records: Iterable[EpisodeRecord]) -> None:

@@ -6,22 +6,27 @@ import multiprocessing
 import os
 import resource
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from multiprocessing.connection import wait
 
-from mme_vla.errors import brief, require
+from mme_vla.errors import ERROR, brief, require
+
+UNGUARDED = os.EX_CONFIG
+"""Exit code of a worker process that would start workers of its own when it imports the script."""
+GUARD = (
+    "A worker process imports this script once more, and it starts workers again: keep what it does"
+    ' under `if __name__ == "__main__":`.'
+)
 
 
 def check_main_guard() -> None:
-    """Raise an error in a worker process that imports the script whose workers it is one of."""
-    is_importing = getattr(multiprocessing.current_process(), "_inheriting", False)
-    require(
-        not is_importing,
-        "A worker process imports this script once more, and it starts workers again: keep what"
-        ' it does under `if __name__ == "__main__":`.',
-    )
+    """End a worker process that imports the script whose workers it is one of."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        print(f"{ERROR}{GUARD}", file=sys.stderr, flush=True)
+        os._exit(UNGUARDED)  # the process that started this one raises the error (`last_words`)
 
 
 def end_with_parent() -> None:

@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from helpers import commands
 from mme_vla.cli.command import check_overrides, run_configured
 from mme_vla.config.composition import compose, resolved
+from mme_vla.config.naming import expand_overrides
 from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.config.trees import library_files, library_trees
 from mme_vla.errors import UserError
@@ -146,6 +147,20 @@ def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
         check_overrides(
             "demo", ["model=small,tokendrop_expert,third", "train.lr=1,2"], directory=tree
         )
+
+
+@pytest.mark.parametrize("word", ["split=stress:count=2", "split=twin:stress:count=2"])
+def test_the_amount_of_a_dial_needs_no_quotes(word: str) -> None:
+    value = word.partition("=")[2]
+    for form in (word, f"split='{value}'", f'split="{value}"'):
+        assert compose("evaluate", ["checkpoint=nano", form]).split == value
+    sweep = expand_overrides([f"{word},test"])
+    assert [cfg.split for cfg in check_overrides("evaluate", sweep)] == [value, "test"]
+
+
+def test_other_words_of_a_command_line_stay_as_they_are() -> None:
+    words = ["seed=3", "~memory", "note='a:b=1,a:b=2'", "tasks=[a:b=1]", "output=a=1", "with=x:a=b"]
+    assert expand_overrides(words) == words
 
 
 def test_a_sweep_of_any_command_writes_under_outputs() -> None:

@@ -152,6 +152,7 @@ PREPARE: dict[str, Callable[[dict[str, Any]], None]] = {
     ),
     "docs/probe/analyses.md": analyses,
     "docs/benchmark/benchmark.md": simulated,
+    "docs/probe/events.md": lambda space: space.update(__name__="__main__"),
     "docs/start/getting-started.md": lambda space: (saved_policy(), robot(space)),
     "docs/serve/serving.md": robot,
     "docs/train/subgoals.md": subgoals,

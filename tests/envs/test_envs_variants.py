@@ -96,6 +96,8 @@ def test_an_environment_of_a_variant_is_made_by_its_split() -> None:
         ("PickXtimes", "stress", "say which dial is turned how far, as stress:count=2"),
         ("PickXtimes", "stress:counts=2", "there is no dial 'counts'. Did you mean 'count'"),
         ("PickXtimes", "stress:swaps=2", "PickXtimes has no dial 'swaps'; it has count"),
+        ("PickXtimes", "twin:twin", "name twin once, as twin:test"),
+        ("PickXtimes", "twin:twin:hard", "name twin once, as twin:hard"),
         ("BinFill", "tset", "Unknown split 'tset'. Did you mean 'test'?"),
     ],
 )

@@ -3,6 +3,7 @@
 import gc
 import multiprocessing
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -231,6 +232,21 @@ def test_closing_ends_a_worker_whose_reply_nobody_took() -> None:
     start = time.monotonic()
     envs.close()
     assert time.monotonic() - start < pool._CLOSING_SECONDS, "it had to be terminated"
+
+
+def test_a_script_without_a_guard_ends_with_an_error_that_names_it(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from mme_vla.envs.vector.pool import Job, VecEnv\n"
+        "with VecEnv([Job('StopCube', 'test', 0)], 1, dict) as envs:\n"
+        "    envs.start_next(0)\n"
+        "    envs.recv()\n"
+        "    print('went on')\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, cwd=tmp_path)
+    *_, last = done.stderr.splitlines()
+    assert last.startswith("mme_vla.errors.UserError: ") and "__main__" in last
+    assert (done.returncode, done.stdout, "During handling" in done.stderr) == (1, "", False)
 
 
 def tell(inherited: tuple[Any, Any], file: Path) -> None:

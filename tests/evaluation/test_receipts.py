@@ -5,7 +5,8 @@ import lzma
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ pytest.importorskip("mani_skill", reason="scenes are built, which needs the extr
 
 from helpers.nano_policies import nano
 from helpers.rollout_fakes import quick_policy
-from mme_vla import UserError
+from mme_vla import UserError, registry
 from mme_vla.cli.results import main
+from mme_vla.config import plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.evaluation import receipts
@@ -212,6 +214,47 @@ def test_scenes_of_an_environment_that_is_not_here_are_not_compared(
     assert any(line.startswith("scenes: ") for line in result.not_compared)
 
 
+@pytest.fixture
+def of_a_plugin(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of a run in an environment of the module `foreign_env`, which lies there."""
+    for path in (finished, finished.with_name("run.json")):
+        rewrite(path, lambda content: content["settings"].update(env="of_a_plugin"))
+    (tmp_path / "foreign_env.py").write_text(
+        "from mme_vla.envs.benchmark import RoboMME\nfrom mme_vla.registry import ENVS\n\n\n"
+        "@ENVS.register('of_a_plugin')\nclass Foreign(RoboMME):\n    pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(plugins, "_imported", {})
+    monkeypatch.setattr(registry.ENVS, "_entries", dict(registry.ENVS._entries))
+    yield tmp_path
+    sys.modules.pop("foreign_env", None)
+
+
+def test_an_environment_of_a_plugin_is_verified_with_its_module(of_a_plugin: Path) -> None:
+    assert verified_by_command(of_a_plugin) == 3
+    assert verified_by_command(of_a_plugin, "--trust-plugins") == 3, "the receipt names no module"
+    assert "foreign_env" not in sys.modules
+    assert verified_by_command(of_a_plugin, "--plugins", "foreign_env") == 0
+
+
+@pytest.mark.parametrize("option", ["--trust-plugins", "trust_plugins=true"])
+def test_installed_code_that_a_receipt_names_needs_trust(
+    option: str,
+    of_a_plugin: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    extension = registry.Extension(parts={"env": {"of_a_plugin": "foreign_env"}})
+    for module in (plugins, registry):
+        monkeypatch.setattr(module, "installed_extensions", lambda: (extension,))
+    monkeypatch.syspath_prepend(of_a_plugin)
+    assert verified_by_command(of_a_plugin) == 3
+    assert "scenes: env=of_a_plugin needs the plugin foreign_env" in capsys.readouterr().out
+    assert "foreign_env" not in sys.modules
+    assert verified_by_command(of_a_plugin, option) == 0
+
+
 def test_a_receipt_is_named_after_its_records_packed_or_not() -> None:
     names = {"episodes.jsonl": "receipt.json", "episodes.jsonl.xz": "receipt.json"}
     names |= {
@@ -337,6 +380,65 @@ def test_episodes_whose_scene_is_not_named_are_not_compared(
     rewrite_records(finished, scene=scene)
     result = receipts.verify(finished)
     assert result.word == "not compared" and reason in result.not_compared[0]
+
+
+def verified_by_command(path: Path, *options: str) -> int:
+    """Exit code of the command."""
+    try:
+        main(["verify", str(path), *options])
+    except SystemExit as ended:
+        return int(str(ended.code))
+    return 0
+
+
+@pytest.mark.parametrize("name", ["episodes-1of2.jsonl", "episodes-1of2.jsonl.xz"])
+def test_records_that_no_receipt_names_are_not_compared(
+    name: str, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    further = finished.with_name(name)
+    shutil.copy(finished.with_name("episodes.jsonl"), further)
+    line = f"records: no receipt names {name}."
+    assert receipts.verify(finished) == ([], [line], [])
+    # a receipt of the same name that is of the other file
+    shutil.copy(finished, receipts.receipt_file(further))
+    assert receipts.verify(finished) == ([], [line], [])
+    below = finished.parent / "below"
+    below.mkdir()
+    further.rename(below / name)
+    assert receipts.verify(finished).word == "agrees"
+    assert verified_by_command(finished.parent) == 3
+    assert f"{below / name}: not compared" in capsys.readouterr().out
+
+
+def test_records_and_others_under_the_same_name_compressed_are_both_compared(
+    finished: Path,
+) -> None:
+    records = finished.with_name("episodes.jsonl")
+    packed = finished.with_name("episodes.jsonl.xz")
+    packed.write_bytes(lzma.compress(records.read_bytes()))
+    assert receipts.verify(finished).word == "agrees"
+    forged = EpisodeRecord.from_json(records.read_text())
+    packed.write_bytes(lzma.compress(replace(forged, outcome="success").to_json().encode() + b"\n"))
+    assert receipts.verify(finished).word == "differs"
+
+
+def test_a_receipt_of_a_killed_process_is_not_compared_with_its_records(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, files = receipts.write_json, []
+    monkeypatch.setattr(receipts, "write_json", lambda *file: files.append(file))
+    path = run(tmp_path, checkpoint, range(1))
+    begun, ended = files
+    write(*begun)  # all that a killed process writes
+    line = "records: their process was killed before it wrote their score."
+    assert receipts.verify(path) == ([], [line], [])
+    write(*ended)
+    assert receipts.verify(path).word == "agrees"
+    write(*begun)
+    records = tmp_path / "episodes.jsonl"
+    other = replace(EpisodeRecord.from_json(records.read_text()), max_steps=9)
+    records.write_text(other.to_json() + "\n")
+    assert receipts.verify(path).word == "differs", "the settings are compared as of any other"
 
 
 def test_tasks_that_are_not_here_are_not_compared(finished: Path) -> None:

@@ -177,6 +177,16 @@ def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
         merge([early], "lst")
 
 
+def test_times_of_several_zones_are_compared_as_times() -> None:
+    late = record(when="2026-01-01T12:00:00+00:00")
+    for when in ("2026-01-01T13:30:00+02:00", "2026-01-01T11:30:00Z", "2026-01-01T11:30:00"):
+        early = record(outcome="fail", when=when)
+        for order in ([early, late], [late, early]):
+            assert (merge(order, "first"), merge(order, "last")) == ([early], [late])
+    with pytest.raises(UserError, match="when='yesterday' is no time"):
+        merge([late, record(outcome="fail", when="yesterday")], "first")
+
+
 def test_one_episode_in_two_environments_is_refused() -> None:
     with pytest.raises(UserError, match="seeds 540000 and 1"):
         merge([record(), record(seed=1)])

@@ -415,7 +415,9 @@ def test_a_wrong_key_of_the_command_is_named(choice: dict[str, Any], message: st
 def test_what_cannot_be_served_is_refused_before_the_first_episode(
     stubs: Any, inline: None, tmp_path: Path
 ) -> None:
-    with pytest.raises(UserError, match=r"No policy server responds.*repeat the command"):
+    with pytest.raises(
+        UserError, match=r"No policy server.*refused\. Start the server, then repeat"
+    ):
         connect("ws://127.0.0.1:9", "openpi", open_s=0.1)
     with stubs.serving("openpi", stubs.Stub()) as url:
         with pytest.raises(UserError, match="is no server of this library"):

@@ -17,7 +17,7 @@ from typing import Any
 
 from mme_vla import errors
 from mme_vla.config.plugins import import_plugins, imported_plugins
-from mme_vla.utils.processes import end_with_parent
+from mme_vla.utils.processes import GUARD, UNGUARDED, end_with_parent
 
 PRELOADED = ["mme_vla.envs.task"]
 """Modules that simulating processes import before they begin; fixed when the first of them is
@@ -100,9 +100,15 @@ def _is_of_plugin(frame: FrameType) -> bool:
 
 
 def last_words(process: Any) -> str:
-    """How a process ended."""
+    """How a process ended.
+
+    Raises:
+        UserError: it imported a script that would have started workers again.
+    """
     process.join(1.0)
     code = process.exitcode
+    if code == UNGUARDED:
+        raise errors.UserError(GUARD) from None
     if code is not None and code < 0:
         return f"died of signal {-code}"
     return f"ended with exit code {code}"

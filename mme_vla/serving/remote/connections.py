@@ -43,8 +43,8 @@ def open_patiently[T](connect: Callable[[], T], seconds: float) -> T:
         except ConnectionError as error:
             if time.monotonic() >= until:
                 raise UserError(
-                    f"{error} Start the server, then repeat the command: finished episodes are"
-                    " kept."
+                    f"{str(error).rstrip('.')}. Start the server, then repeat the command: finished"
+                    " episodes are kept."
                 ) from None
         time.sleep(PAUSE_S)
 
