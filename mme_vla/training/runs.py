@@ -2,13 +2,15 @@
 change then.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from mme_vla.config.naming import flat
+from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.data.sources import listed_sources
 from mme_vla.errors import UserError, brief, counted, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import (
@@ -58,8 +60,8 @@ MAY_DIFFER = (
 changes a loss.
 
 The name is a label alone. `data.content` and `data.side_files`, digests of the datasets, are
-compared when they are open (`check_content`). A run's statistics stay what they are:
-`data.narrow_ranges` decides only whether it continues with narrow ones.
+compared when they are open (`check_content`), so their places may differ, too. A run's statistics
+stay what they are: `data.narrow_ranges` decides only whether it continues with narrow ones.
 """
 
 
@@ -174,6 +176,11 @@ def check_settings(checkpoint: Path, then: Mapping[str, Any], now: Mapping[str, 
     listing = "\n".join(lines)
     if "train.schedule_steps" in changed:
         listing += "\nA cosine without schedule_steps ends with the run it began in."
+    if any(key.startswith("data.sources.") and key.endswith(".name") for key in changed):
+        listing += (
+            "\nA dataset may lie elsewhere, under the name it had (it decides which episodes are"
+            " held out): data.sources=[{root: <folder>, name: <name>}]"
+        )
     raise UserError(
         f"{checkpoint} was trained with other settings, so continuing from it would be another"
         f" run:\n{listing}\nRepeat the settings of {checkpoint.parent.parent / CONFIG}, or start"
@@ -209,8 +216,9 @@ def check_content(
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Dotted keys that a run may not change, with their values in two plain configurations."""
-    before = flat(to_json(old))
-    after = flat(to_json(new))
+    began_with = (old.get("data") or {}).keys()
+    before = flat(_named_sources(to_json(old), began_with))
+    after = flat(_named_sources(to_json(new), began_with))
     for values in (before, after):
         # A cosine without an end of its own ends with the run.
         is_cosine = values.get("train.schedule") == "cosine"
@@ -222,6 +230,29 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
         if not may_differ and before.get(key) != after.get(key):
             differing[key] = (before.get(key), after.get(key))
     return differing
+
+
+def _named_sources(config: dict[str, Any], began_with: Collection[str]) -> dict[str, Any]:
+    """A plain configuration in which `data.sources` are numbered, spelled in one way, and without
+    the places whose content `check_content` compares.
+
+    Args:
+        began_with: the keys of `data` that the run began with; earlier versions kept no digests.
+    """
+    data = config.get("data") or {}
+    if "sources" not in data:
+        return config
+    sources = {}
+    for number, entry in enumerate(listed_sources(data["sources"])):
+        section = {"name": entry.short_name}
+        root = SAMPLE if entry.root == "sample" else Path(entry.root).expanduser().resolve()
+        # the embedded sample holds out an episode of its own
+        if "content" not in began_with or root == SAMPLE:
+            section["root"] = str(root)
+        if "side_files" not in began_with and entry.exec_starts is not None:
+            section["exec_starts"] = str(Path(entry.exec_starts).resolve())
+        sources[str(number)] = section
+    return {**config, "data": {**data, "sources": sources}}
 
 
 def _holds_run(folder: Path) -> bool:
