@@ -38,6 +38,7 @@ from mme_vla.training.runs import (
     SUMMARY,
     Run,
     check_content,
+    check_kind,
     claim_run,
     open_run,
     start_from,
@@ -80,12 +81,13 @@ def train_several(run: TrainRun, folder: Path) -> list[Path]:
     vision cache.
 
     Raises:
-        UserError: a training there by other settings.
+        UserError: a training there by other settings, or a single run.
     """
     if run.resume == "auto":
         folder = unfinished_trainings(folder, run.trainings)
     elif run.resume is not None:
         folder = Path(run.resume)
+    check_kind(folder, several=True)
     checkpoints = []
     for number in range(run.trainings):
         place = folder / training_name(number)

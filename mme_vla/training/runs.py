@@ -122,6 +122,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         resume: None, `auto`, or the path of a run or one of its checkpoints.
         config: the composed configuration, plain.
     """
+    if resume in (None, "auto"):
+        check_kind(folder, several=False)
     if resume is None:
         require(
             not _holds_run(folder),
@@ -253,6 +255,24 @@ def _named_sources(config: dict[str, Any], began_with: Collection[str]) -> dict[
             section["exec_starts"] = str(Path(entry.exec_starts).resolve())
         sources[str(number)] = section
     return {**config, "data": {**data, "sources": sources}}
+
+
+def check_kind(folder: Path, several: bool) -> None:
+    """Refuse a single run's folder for several trainings, and the reverse: where both are in one
+    folder, commands take different policies from it.
+    """
+    if several:
+        require(
+            not _holds_run(folder),
+            f"{folder} holds a single run: leave trainings=… out to continue it with"
+            f" resume={folder}, or choose another output.",
+        )
+    else:
+        require(
+            not any(map(_holds_run, folder.glob("training_*"))),
+            f"{folder} holds trainings of one recipe: add trainings=… to continue them, or choose"
+            " another output.",
+        )
 
 
 def _holds_run(folder: Path) -> bool:
