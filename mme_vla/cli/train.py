@@ -62,7 +62,7 @@ def main(cfg: DictConfig) -> None:
         if run.trainings == 1:
             train(run, folder, begun, named)
         else:
-            train_several(run, folder)
+            train_several(run, folder, named)
     except UserError:
         with suppress(OSError):
             folder.rmdir()  # Hydra made it; it stays if it holds anything
@@ -72,7 +72,7 @@ def main(cfg: DictConfig) -> None:
         distributed.destroy_process_group()
 
 
-def train_several(run: TrainRun, folder: Path) -> list[Path]:
+def train_several(run: TrainRun, folder: Path, named: bool = True) -> list[Path]:
     """Train several policies by one recipe, with consecutive seeds, one after the other; their last
     checkpoints.
 
@@ -80,12 +80,15 @@ def train_several(run: TrainRun, folder: Path) -> list[Path]:
     interrupted resumes. All have the vision tower of the first, frozen or to begin with, and so one
     vision cache.
 
+    Args:
+        named: as for `train`.
+
     Raises:
         UserError: a training there by other settings, or a single run.
     """
-    if run.resume == "auto":
+    if run.resume == "auto" and not named:
         folder = unfinished_trainings(folder, run.trainings)
-    elif run.resume is not None:
+    elif run.resume not in (None, "auto"):
         folder = Path(run.resume)
     check_kind(folder, several=True)
     checkpoints = []
@@ -93,7 +96,7 @@ def train_several(run: TrainRun, folder: Path) -> list[Path]:
         place = folder / training_name(number)
         own = {"seed": run.seed + number, "output": str(place), "resume": "auto"}
         one = TrainRun.from_config({**run.config, **own})
-        existing = open_run(place, "auto", one.config)
+        existing = open_run(place, "auto", one.config, named=True)
         is_finished = (place / SUMMARY).is_file() and existing.step == one.train.steps
         if is_finished and existing.checkpoint is not None:
             checkpoints.append(existing.checkpoint)

@@ -94,7 +94,7 @@ def claim_run(
     for number in range(1, 1000):
         place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
         try:
-            run = open_run(place, resume, config)
+            run = open_run(place, resume, config, named)
             lock = FolderLock(run.folder, "training run").acquire()
         except UserError:
             if named or resume is not None or not (_holds_run(place) or (place / LOCK).exists()):
@@ -102,7 +102,7 @@ def claim_run(
             continue
         try:
             # what decided may have changed before the folder was held
-            again = open_run(place, resume, config)
+            again = open_run(place, resume, config, named)
             if again.folder == run.folder:
                 return again, lock
             raise UserError(
@@ -114,13 +114,16 @@ def claim_run(
     raise UserError(f"{folder} and the names after it are taken: choose another output.")
 
 
-def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run:
+def open_run(
+    folder: Path, resume: str | None, config: Mapping[str, Any], named: bool = False
+) -> Run:
     """Decide where this run writes and where it starts; nothing is written yet.
 
     Args:
         folder: of a new run.
         resume: None, `auto`, or the path of a run or one of its checkpoints.
         config: the composed configuration, plain.
+        named: whether the user chose `folder`: then `auto` means the run in it, and none beside it.
     """
     if resume in (None, "auto"):
         check_kind(folder, several=False)
@@ -132,12 +135,22 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         )
         return Run(folder)
     if resume == "auto":
-        newest = _newest_unfinished(folder)
+        own = checkpoints_in(folder / CHECKPOINTS)
+        newest = own[-1] if own else None
+        if not own and not named:
+            newest = _unfinished_beside(folder)
         if newest is None:
             return Run(folder)
-        checkpoint = newest
-    else:
-        checkpoint = resolve_checkpoint(Path(resume))
+        try:
+            return open_run(folder, str(newest), config)
+        except UserError as error:
+            if own:
+                raise
+            raise UserError(
+                f"{error}\nresume=auto chose that run, the newest unfinished one in"
+                f" {folder.parent}. Leave it out to begin a new one."
+            ) from None
+    checkpoint = resolve_checkpoint(Path(resume))
     state = read_state(checkpoint)
     check_settings(checkpoint, state["config"], config)
     steps: int = config["train"]["steps"]
@@ -279,20 +292,15 @@ def _holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
 
 
-def _newest_unfinished(folder: Path) -> Path | None:
-    """The last checkpoint in `folder`, else of the run beside it that wrote last, unless that run
-    is finished.
+def _unfinished_beside(folder: Path) -> Path | None:
+    """The last checkpoint of the run beside `folder` that wrote last, unless that run is
+    finished.
     """
-    beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
-    beside.sort(key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)
-    for run in [folder, *beside]:
-        checkpoints = checkpoints_in(run / CHECKPOINTS)
-        if not checkpoints:
-            continue
-        if run != folder and (run / SUMMARY).is_file():
-            return None
-        return checkpoints[-1]
-    return None
+    beside = [path for path in folder.parent.glob("*") if checkpoints_in(path / CHECKPOINTS)]
+    newest = max(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, default=None)
+    if newest is None or (newest / SUMMARY).is_file():
+        return None
+    return checkpoints_in(newest / CHECKPOINTS)[-1]
 
 
 def unfinished_trainings(folder: Path, count: int) -> Path:

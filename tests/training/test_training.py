@@ -207,6 +207,10 @@ def test_auto_resumes_the_newest_unfinished_run_or_begins(two_steps: Path, tmp_p
     assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
     shutil.copytree(two_steps, tmp_path / "a")
     assert open_run(tmp_path / "b", "auto", config).folder == tmp_path / "a"
+    with pytest.raises(UserError, match=r"seed: 1 then, 2 now(.|\n)*resume=auto chose that run"):
+        open_run(tmp_path / "b", "auto", {**config, "seed": 2})
+    assert open_run(tmp_path / "b", "auto", config, named=True) == Run(tmp_path / "b")
+    assert open_run(tmp_path / "a", "auto", config, named=True).step == 2
     (tmp_path / "a" / "summary.json").write_text("{}")
     assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
 
