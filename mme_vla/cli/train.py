@@ -220,6 +220,10 @@ def _train(
             trainer.close()
         if finished:
             finish(trainer, data, time.perf_counter() - begun, line, loggers)
+        else:
+            folder = place.folder if run.trainings == 1 else place.folder.parent
+            words = ["mme-vla", "train", *running_words("resume="), f"resume={folder}"]
+            line.say(f"Continue by the same command with resume=:\n  {shlex.join(words)}")
     finally:
         loggers.close()
     return trainer
@@ -279,14 +283,7 @@ def open_data(
     encoder = broadcast_object_list(encoder)
     # The command that builds the vision cache of this run: the same words, but for those on
     # resuming and output.
-    words = ["mme-vla", "cache", "model=<model>", "data=<data>"]
-    if HydraConfig.initialized():
-        words = words[:2]
-        for tree in command_trees()[1:]:
-            words += ["--config-dir", str(tree)]
-        for word in HydraConfig.get().overrides.task:
-            if not word.startswith(("resume=", "output=", "trainings=")):
-                words.append(word)
+    words = ["mme-vla", "cache", *running_words("resume=", "output=", "trainings=")]
     first_one = accelerator.main_process_first
     if run.data.cache.local:
         first_one = accelerator.local_main_process_first
@@ -297,6 +294,19 @@ def open_data(
     if place.checkpoint is not None:
         check_content(place.checkpoint, data.content, data.side_files)
     return data
+
+
+def running_words(*left_out: str) -> list[str]:
+    """The words of the running command, without overrides that begin with one of `left_out`."""
+    if not HydraConfig.initialized():
+        return ["model=<model>", "data=<data>"]
+    words = []
+    for tree in command_trees()[1:]:
+        words += ["--config-dir", str(tree)]
+    for word in HydraConfig.get().overrides.task:
+        if not word.startswith(left_out):
+            words.append(word)
+    return words
 
 
 def held_out(
