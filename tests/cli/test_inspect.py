@@ -232,6 +232,8 @@ def test_draft_trains_and_the_checkpoint_is_checked_open_loop(
     assert "squid: cameras top" in printed and "1 of 1 updates" in printed
     assert "held-out episode 1 of squid" in printed, "the check at the end of training"
 
+    with pytest.raises(UserError, match=r"step=3 is a frame of an episode: add episode="):
+        main(compose("inspect", ["dataset=sample", "step=3"]))
     with pytest.raises(UserError, match=r"step=3 draws .* add episode="):
         main(compose("inspect", ["checkpoint=run", "dataset=squid", "step=3"]))
     with pytest.raises(UserError, match="squid has episodes 0 … 1"):
