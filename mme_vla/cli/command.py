@@ -33,7 +33,11 @@ from mme_vla.config.composition import (
     parse,
     resolved,
 )
-from mme_vla.config.naming import expand_overrides, join_memories
+from mme_vla.config.naming import (
+    expand_overrides,
+    join_memories,
+    name_composition,
+)
 from mme_vla.config.override_errors import Names, badly_spaced, bare_word, paths, unknown_option
 from mme_vla.config.plugins import TRUST_FLAG
 from mme_vla.config.trees import config_dir, library_trees
@@ -70,6 +74,7 @@ def run_configured(
                 raise UserError(f"A value is needed for {', '.join(missing)}: add {needed}")
             join_memories(cfg)
             hydra_cfg = HydraConfig.get()
+            name_composition(cfg, hydra_cfg.overrides.task)
             name = str(hydra_cfg.job.config_name)
             join_plugins(cfg, name, command_trees(), hydra_cfg.overrides.task)
             plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
@@ -106,7 +111,8 @@ class NewFolders(Callback):
     """The run's folder and those above it that were not there, from the inside."""
 
     def on_run_start(self, config: DictConfig, **_: object) -> None:
-        """Called by Hydra before it makes the folder."""
+        """Called by Hydra before it makes the folder, which the composition may give its name."""
+        name_composition(join_memories(config), config.hydra.overrides.task)
         folder = Path(str(config.hydra.run.dir)).absolute()
         NewFolders.made = [path for path in (folder, *folder.parents) if not path.exists()]
 

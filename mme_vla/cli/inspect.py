@@ -116,6 +116,11 @@ def main(cfg: DictConfig) -> None:
         return
     source = EpisodeSource(inspection.dataset, inspection.exec_starts, robot=robot)
     if inspection.episode is None:
+        require(
+            inspection.step is None,
+            f"step={inspection.step} is a frame of an episode: add episode=…, or leave step out to"
+            " list the dataset's episodes.",
+        )
         show_dataset(source, console)
         return
     episode, step = check_place(source, inspection.episode, inspection.step)

@@ -38,6 +38,7 @@ from mme_vla.training.runs import (
     SUMMARY,
     Run,
     check_content,
+    check_kind,
     claim_run,
     open_run,
     start_from,
@@ -61,7 +62,7 @@ def main(cfg: DictConfig) -> None:
         if run.trainings == 1:
             train(run, folder, begun, named)
         else:
-            train_several(run, folder)
+            train_several(run, folder, named)
     except UserError:
         with suppress(OSError):
             folder.rmdir()  # Hydra made it; it stays if it holds anything
@@ -71,7 +72,7 @@ def main(cfg: DictConfig) -> None:
         distributed.destroy_process_group()
 
 
-def train_several(run: TrainRun, folder: Path) -> list[Path]:
+def train_several(run: TrainRun, folder: Path, named: bool = True) -> list[Path]:
     """Train several policies by one recipe, with consecutive seeds, one after the other; their last
     checkpoints.
 
@@ -79,19 +80,23 @@ def train_several(run: TrainRun, folder: Path) -> list[Path]:
     interrupted resumes. All have the vision tower of the first, frozen or to begin with, and so one
     vision cache.
 
+    Args:
+        named: as for `train`.
+
     Raises:
-        UserError: a training there by other settings.
+        UserError: a training there by other settings, or a single run.
     """
-    if run.resume == "auto":
+    if run.resume == "auto" and not named:
         folder = unfinished_trainings(folder, run.trainings)
-    elif run.resume is not None:
+    elif run.resume not in (None, "auto"):
         folder = Path(run.resume)
+    check_kind(folder, several=True)
     checkpoints = []
     for number in range(run.trainings):
         place = folder / training_name(number)
         own = {"seed": run.seed + number, "output": str(place), "resume": "auto"}
         one = TrainRun.from_config({**run.config, **own})
-        existing = open_run(place, "auto", one.config)
+        existing = open_run(place, "auto", one.config, named=True)
         is_finished = (place / SUMMARY).is_file() and existing.step == one.train.steps
         if is_finished and existing.checkpoint is not None:
             checkpoints.append(existing.checkpoint)
@@ -215,6 +220,10 @@ def _train(
             trainer.close()
         if finished:
             finish(trainer, data, time.perf_counter() - begun, line, loggers)
+        else:
+            folder = place.folder if run.trainings == 1 else place.folder.parent
+            words = ["mme-vla", "train", *running_words("resume="), f"resume={folder}"]
+            line.say(f"Continue by the same command with resume=:\n  {shlex.join(words)}")
     finally:
         loggers.close()
     return trainer
@@ -274,14 +283,7 @@ def open_data(
     encoder = broadcast_object_list(encoder)
     # The command that builds the vision cache of this run: the same words, but for those on
     # resuming and output.
-    words = ["mme-vla", "cache", "model=<model>", "data=<data>"]
-    if HydraConfig.initialized():
-        words = words[:2]
-        for tree in command_trees()[1:]:
-            words += ["--config-dir", str(tree)]
-        for word in HydraConfig.get().overrides.task:
-            if not word.startswith(("resume=", "output=", "trainings=")):
-                words.append(word)
+    words = ["mme-vla", "cache", *running_words("resume=", "output=", "trainings=")]
     first_one = accelerator.main_process_first
     if run.data.cache.local:
         first_one = accelerator.local_main_process_first
@@ -292,6 +294,19 @@ def open_data(
     if place.checkpoint is not None:
         check_content(place.checkpoint, data.content, data.side_files)
     return data
+
+
+def running_words(*left_out: str) -> list[str]:
+    """The words of the running command, without overrides that begin with one of `left_out`."""
+    if not HydraConfig.initialized():
+        return ["model=<model>", "data=<data>"]
+    words = []
+    for tree in command_trees()[1:]:
+        words += ["--config-dir", str(tree)]
+    for word in HydraConfig.get().overrides.task:
+        if not word.startswith(left_out):
+            words.append(word)
+    return words
 
 
 def held_out(

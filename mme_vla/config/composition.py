@@ -28,7 +28,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from mme_vla.config import plugins
-from mme_vla.config.naming import expand_overrides, join_memories
+from mme_vla.config.naming import (
+    expand_overrides,
+    join_memories,
+    name_composition,
+)
 from mme_vla.config.override_errors import (
     COMPOSITION_ERRORS,
     FORMS,
@@ -149,6 +153,7 @@ def compose(
             f"The section `{group}` has no name, only {', '.join(map(str, section or ()))}. Choose"
             f" one: {group}=<name>; its keys are set beside it, {group}.<key>=<value>.",
         )
+    name_composition(cfg, words)
     join_plugins(cfg, config_name, trees, words)
     return cfg
 

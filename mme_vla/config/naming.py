@@ -75,6 +75,29 @@ def join_memories(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
+DEFAULT_MODEL = "tokendrop_expert"
+"""The model of configs/policy.yaml."""
+
+
+def name_composition(cfg: DictConfig, overrides: Iterable[str]) -> DictConfig:
+    """A configuration whose memory or integration the command line chose without a model has a name
+    of its own, such as `rmt_modulator`: the default model is another one.
+
+    Changed in place, and returned.
+    """
+    keys = {word.lstrip("+").partition("=")[0] for word in overrides}
+    is_chosen = bool(keys & {"memory", "memory.name", "integration", "integration.name"})
+    if not is_chosen or keys & {"model", "name"} or cfg.get("name") != DEFAULT_MODEL:
+        return cfg
+    memory = cfg.get("memory") or {}
+    names = []
+    for member in memory.get("members") or [memory]:
+        names.append(member.get("name") if isinstance(member, Mapping) else member)
+    parts = ["+".join(filter(None, names)), (cfg.get("integration") or {}).get("name")]
+    cfg.name = "_".join(filter(None, parts)) or "memoryless"
+    return cfg
+
+
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
 

@@ -177,10 +177,15 @@ def check_vectors(root: Path, table: Any, name: str, width: int) -> tuple[np.nda
             numbers = flat(chunk).to_numpy(zero_copy_only=False)  # nulls become NaN
             values = numbers.reshape(-1, width)
             with np.errstate(over="ignore"):
-                wrong = ~np.isfinite(values.astype(np.float32)).all(axis=1)  # as policies read them
+                is_finite = np.isfinite(values.astype(np.float32))  # as policies read them
+            wrong = ~is_finite.all(axis=1)
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
-            value = brief(chunk[row].as_py())
+            found = chunk[row].as_py()
+            value = brief(found)
+            if isinstance(found, list):
+                number = int(np.argmin(is_finite[row]))  # the first that is not
+                value = f"{values[row, number]} for number {number + 1}"
             raise UserError(
                 f"{root}: row {first + row} has {name} {value}; expected {width} finite numbers"
                 f" within float32 (to 3.4e38). {REMEDY}"

@@ -52,7 +52,7 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
         UserError: no camera, no state or no action was found.
     """
     name = re.sub(r"\W+", "_", root.resolve().name.lower(), flags=re.ASCII).strip("_") or "robot"
-    if name in taken or name[0].isdigit():
+    if name in taken or name in _WORDS or name[0].isdigit():
         name = f"own_{name}"
     cameras = _cameras(info.features)
     state = _vectors(info.features, ("observation.state", "state"), "observation.")

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import stack_history
 from mme_vla.processing.images import stack_past
 from mme_vla.processing.normalise import NormStats, normalize
@@ -137,6 +137,11 @@ class PolicyProcessor:
     def stats(self, stats: NormStats | None) -> None:
         robot = self.embodiment
         if stats is not None:
+            require(
+                isinstance(stats, NormStats),
+                f"processor.stats={brief(stats)} must be a NormStats: NormStats.load(path) of"
+                " mme_vla.processing reads a norm_stats.json.",
+            )
             widths = len(stats.state), len(stats.actions)
             require(
                 widths == (robot.state.width, robot.action.width),
@@ -151,8 +156,9 @@ class PolicyProcessor:
         if self._stats is None:
             raise UserError(
                 "States and actions need normalisation statistics, and this processor has none."
-                " Training computes them from its data; otherwise set processor.stats to a"
-                " norm_stats.json (one is in every checkpoint)."
+                " Training computes them from its data, and every checkpoint holds them. In Python:"
+                " policy.processor.stats = NormStats.load('<checkpoint>/norm_stats.json'), of"
+                " mme_vla.processing."
             )
         return self._stats
 

@@ -214,10 +214,7 @@ class Trainer:
                             line.say(f"no self-check in the checkpoint: {self.unchecked}")
                 if stopping:
                     self.stopped_by = stop.signal
-                    line.say(
-                        f"Stopped at step {done} as asked; continue with"
-                        f" resume={self.run_info.folder}"
-                    )
+                    line.say(f"Stopped at step {done} as asked.")
                     return False
         return True
 

@@ -2,13 +2,15 @@
 change then.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from mme_vla.config.naming import flat
+from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.data.sources import listed_sources
 from mme_vla.errors import UserError, brief, counted, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import (
@@ -58,8 +60,8 @@ MAY_DIFFER = (
 changes a loss.
 
 The name is a label alone. `data.content` and `data.side_files`, digests of the datasets, are
-compared when they are open (`check_content`). A run's statistics stay what they are, whatever
-`data.narrow_ranges` says.
+compared when they are open (`check_content`), so their places may differ, too. A run's statistics
+stay what they are, whatever `data.narrow_ranges` says.
 """
 
 
@@ -92,7 +94,7 @@ def claim_run(
     for number in range(1, 1000):
         place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
         try:
-            run = open_run(place, resume, config)
+            run = open_run(place, resume, config, named)
             lock = FolderLock(run.folder, "training run").acquire()
         except UserError:
             if named or resume is not None or not (_holds_run(place) or (place / LOCK).exists()):
@@ -100,7 +102,7 @@ def claim_run(
             continue
         try:
             # what decided may have changed before the folder was held
-            again = open_run(place, resume, config)
+            again = open_run(place, resume, config, named)
             if again.folder == run.folder:
                 return again, lock
             raise UserError(
@@ -112,14 +114,19 @@ def claim_run(
     raise UserError(f"{folder} and the names after it are taken: choose another output.")
 
 
-def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run:
+def open_run(
+    folder: Path, resume: str | None, config: Mapping[str, Any], named: bool = False
+) -> Run:
     """Decide where this run writes and where it starts; nothing is written yet.
 
     Args:
         folder: of a new run.
         resume: None, `auto`, or the path of a run or one of its checkpoints.
         config: the composed configuration, plain.
+        named: whether the user chose `folder`: then `auto` means the run in it, and none beside it.
     """
+    if resume in (None, "auto"):
+        check_kind(folder, several=False)
     if resume is None:
         require(
             not _holds_run(folder),
@@ -128,12 +135,22 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         )
         return Run(folder)
     if resume == "auto":
-        newest = _newest_unfinished(folder)
+        own = checkpoints_in(folder / CHECKPOINTS)
+        newest = own[-1] if own else None
+        if not own and not named:
+            newest = _unfinished_beside(folder)
         if newest is None:
             return Run(folder)
-        checkpoint = newest
-    else:
-        checkpoint = resolve_checkpoint(Path(resume))
+        try:
+            return open_run(folder, str(newest), config)
+        except UserError as error:
+            if own:
+                raise
+            raise UserError(
+                f"{error}\nresume=auto chose that run, the newest unfinished one in"
+                f" {folder.parent}. Leave it out to begin a new one."
+            ) from None
+    checkpoint = resolve_checkpoint(Path(resume))
     state = read_state(checkpoint)
     check_settings(checkpoint, state["config"], config)
     steps: int = config["train"]["steps"]
@@ -174,6 +191,11 @@ def check_settings(checkpoint: Path, then: Mapping[str, Any], now: Mapping[str, 
     listing = "\n".join(lines)
     if "train.schedule_steps" in changed:
         listing += "\nA cosine without schedule_steps ends with the run it began in."
+    if any(key.startswith("data.sources.") and key.endswith(".name") for key in changed):
+        listing += (
+            "\nA dataset may lie elsewhere, under the name it had (it decides which episodes are"
+            " held out): data.sources=[{root: <folder>, name: <name>}]"
+        )
     raise UserError(
         f"{checkpoint} was trained with other settings, so continuing from it would be another"
         f" run:\n{listing}\nRepeat the settings of {checkpoint.parent.parent / CONFIG}, or start"
@@ -209,8 +231,9 @@ def check_content(
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Dotted keys that a run may not change, with their values in two plain configurations."""
-    before = flat(to_json(old))
-    after = flat(to_json(new))
+    began_with = (old.get("data") or {}).keys()
+    before = flat(_named_sources(to_json(old), began_with))
+    after = flat(_named_sources(to_json(new), began_with))
     for values in (before, after):
         # A cosine without an end of its own ends with the run.
         is_cosine = values.get("train.schedule") == "cosine"
@@ -224,24 +247,60 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
     return differing
 
 
+def _named_sources(config: dict[str, Any], began_with: Collection[str]) -> dict[str, Any]:
+    """A plain configuration in which `data.sources` are numbered, spelled in one way, and without
+    the places whose content `check_content` compares.
+
+    Args:
+        began_with: the keys of `data` that the run began with; earlier versions kept no digests.
+    """
+    data = config.get("data") or {}
+    if "sources" not in data:
+        return config
+    sources = {}
+    for number, entry in enumerate(listed_sources(data["sources"])):
+        section = {"name": entry.short_name}
+        root = SAMPLE if entry.root == "sample" else Path(entry.root).expanduser().resolve()
+        # the embedded sample holds out an episode of its own
+        if "content" not in began_with or root == SAMPLE:
+            section["root"] = str(root)
+        if "side_files" not in began_with and entry.exec_starts is not None:
+            section["exec_starts"] = str(Path(entry.exec_starts).resolve())
+        sources[str(number)] = section
+    return {**config, "data": {**data, "sources": sources}}
+
+
+def check_kind(folder: Path, several: bool) -> None:
+    """Refuse a single run's folder for several trainings, and the reverse: where both are in one
+    folder, commands take different policies from it.
+    """
+    if several:
+        require(
+            not _holds_run(folder),
+            f"{folder} holds a single run: leave trainings=… out to continue it with"
+            f" resume={folder}, or choose another output.",
+        )
+    else:
+        require(
+            not any(map(_holds_run, folder.glob("training_*"))),
+            f"{folder} holds trainings of one recipe: add trainings=… to continue them, or choose"
+            " another output.",
+        )
+
+
 def _holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
 
 
-def _newest_unfinished(folder: Path) -> Path | None:
-    """The last checkpoint in `folder`, else of the run beside it that wrote last, unless that run
-    is finished.
+def _unfinished_beside(folder: Path) -> Path | None:
+    """The last checkpoint of the run beside `folder` that wrote last, unless that run is
+    finished.
     """
-    beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
-    beside.sort(key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)
-    for run in [folder, *beside]:
-        checkpoints = checkpoints_in(run / CHECKPOINTS)
-        if not checkpoints:
-            continue
-        if run != folder and (run / SUMMARY).is_file():
-            return None
-        return checkpoints[-1]
-    return None
+    beside = [path for path in folder.parent.glob("*") if checkpoints_in(path / CHECKPOINTS)]
+    newest = max(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, default=None)
+    if newest is None or (newest / SUMMARY).is_file():
+        return None
+    return checkpoints_in(newest / CHECKPOINTS)[-1]
 
 
 def unfinished_trainings(folder: Path, count: int) -> Path:

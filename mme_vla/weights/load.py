@@ -22,7 +22,7 @@ from mme_vla.policy.tensor_files import (
     check_values,
     dtype_of,
 )
-from mme_vla.processing.base import CONFIG_FILE, read_settings
+from mme_vla.processing.base import CONFIG_FILE, STATS_FILE, read_settings
 from mme_vla.weights.ports import check_window, port_adapter
 from mme_vla.weights.released import partial_adapter, released_adapter
 from mme_vla.weights.source import Source, method_formats, open_source
@@ -63,8 +63,8 @@ def load_weights(
 
     The policy may lie on the meta device, so that no weight is initialised only to be replaced. A
     checkpoint that carries the statistics of one dataset hands them to the policy's processor;
-    LeRobot's are left (see `read_stats`), and of several none is taken, with a warning that names
-    them.
+    those in LeRobot's own files are left (see `read_stats`), and of several none is taken, with a
+    warning that names them.
 
     Args:
         source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
@@ -76,7 +76,9 @@ def load_weights(
     checkpoint = open_source(source, revision, token, base)
     stats = None
     datasets = list(stats_files(checkpoint.folder))
-    if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
+    # Those in LeRobot's own files belong to other actions.
+    has_fitting = checkpoint.format != "lerobot" or (checkpoint.folder / STATS_FILE).is_file()
+    if policy.processor is not None and has_fitting and len(datasets) < 2:
         stats = read_stats(checkpoint.folder)
     assign_tensors(policy, read_as(policy, checkpoint), str(source), kind)
     recompute_buffers(policy)

@@ -251,6 +251,8 @@ def test_draft_trains_and_the_checkpoint_is_checked_open_loop(
     assert "squid: cameras top" in printed and "1 of 1 updates" in printed
     assert "error validation loss=" in printed and "dataset=… compares actions" in printed
 
+    with pytest.raises(UserError, match=r"step=3 is a frame of an episode: add episode="):
+        main(compose("inspect", ["dataset=sample", "step=3"]))
     with pytest.raises(UserError, match=r"step=3 draws .* add episode="):
         main(compose("inspect", ["checkpoint=run", "dataset=squid", "step=3"]))
     with pytest.raises(UserError, match="squid has episodes 0 … 1"):

@@ -339,3 +339,19 @@ def test_a_model_without_a_name_is_refused_by_the_key_that_lacks(tmp_path: Path)
     mine = write_tree(tmp_path / "mine", {"model/own.yaml": text})
     with pytest.raises(UserError, match=r"value of output .* 'name' not found.*`name: "):
         resolved(compose("train", ["model=own"], extra_dirs=[mine]))
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["memory=rmt", "integration=modulator"], "rmt_modulator"),
+        (["memory=[tokendrop,{name: rmt}]"], "tokendrop+rmt_expert"),
+        (["memory=none", "integration=none"], "memoryless"),
+        (["memory.budget=64"], "tokendrop_expert"),
+        (["model=pi05", "memory=rmt", "integration=context"], "pi05"),
+        (["memory=rmt", "name=mine"], "mine"),
+        (["experiment=real_robot", "data.sources=[a]", "integration=context"], "framesamp_modul"),
+    ],
+)
+def test_a_composition_without_a_model_has_a_name_of_its_own(words: list[str], name: str) -> None:
+    assert compose("train", words).name == name

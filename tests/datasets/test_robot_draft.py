@@ -81,6 +81,13 @@ def test_unusual_columns_are_named() -> None:
     assert set(columns.cameras.values()) == {"images.head", "state"}
 
 
+def test_a_folder_with_the_name_of_a_value_gives_a_name() -> None:
+    info = info_of(top=IMAGE, observation__state=vector(width=2), action=vector(width=2))
+    for folder in ("null", "True"):
+        draft = drafted(info, folder)
+        assert draft.name == robot_of(draft).name == f"own_{folder.lower()}"
+
+
 def test_depth_is_no_camera() -> None:
     depth = {**IMAGE, "info": {"video.is_depth_map": True}}
     info = info_of(

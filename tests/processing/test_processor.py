@@ -141,6 +141,8 @@ def test_settings_without_a_tokenizer_are_refused() -> None:
 
 def test_states_and_actions_need_statistics() -> None:
     bare = processor(stats=None, prompt="state")
+    with pytest.raises(UserError, match=r"'mine\.json' must be a NormStats: NormStats\.load"):
+        bare.stats = "mine.json"
     with pytest.raises(UserError, match=r"norm_stats\.json"):
         bare.actions(np.zeros((5, 8)), np.zeros(8))
     with pytest.raises(UserError, match=r"norm_stats\.json"):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -96,6 +97,23 @@ def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> No
         json.loads((folder / "summary.json").read_text()) for folder in (killed, straight)
     )
     assert resumed_run["open_loop"] == straight_run["open_loop"]
+
+
+@pytest.mark.slow
+def test_a_run_that_is_stopped_prints_the_command_that_continues_it(tmp_path: Path) -> None:
+    stopped = start(tmp_path, "output=run one", "train.steps=500")
+    deadline = time.monotonic() + 200
+    while not read_metrics(tmp_path / "run one"):
+        assert stopped.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    stopped.send_signal(signal.SIGTERM)
+    done = commands.finish(stopped)
+    assert done.returncode == 128 + signal.SIGTERM, done.stderr[-3000:]
+    step = int(done.stdout.split("Stopped at step ")[1].split()[0])
+    command, *words = shlex.split(done.stdout.splitlines()[-1])
+    assert (command, words[0], words[-1]) == ("mme-vla", "train", f"resume={tmp_path / 'run one'}")
+    printed = finish(commands.start("mme_vla", *words, f"train.steps={step + 1}", cwd=tmp_path))
+    assert f"continuing from {tmp_path / 'run one' / 'checkpoints'}" in printed
 
 
 @pytest.mark.slow

@@ -94,3 +94,14 @@ def test_several_trainings_resume_and_share_a_cache(
 def test_the_number_of_trainings_is_checked(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="trainings=0"):
         command.main(compose("train", [*SMALL, f"output={tmp_path}", "trainings=0"]))
+
+
+def test_a_folder_holds_a_single_run_or_several_trainings(tmp_path: Path) -> None:
+    (tmp_path / "one" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "two" / "training_0" / "checkpoints").mkdir(parents=True)
+    with pytest.raises(UserError, match="one holds a single run: leave trainings"):
+        command.main(compose("train", [*SMALL, f"output={tmp_path / 'one'}"]))
+    for resume in ("null", "auto"):
+        words = [*SMALL, "trainings=1", f"output={tmp_path / 'two'}", f"resume={resume}"]
+        with pytest.raises(UserError, match="two holds trainings of one recipe: add trainings"):
+            command.main(compose("train", words))

@@ -180,11 +180,37 @@ def test_a_setting_that_came_or_went_counts_as_changed() -> None:
     )
 
 
+def test_a_dataset_may_lie_elsewhere_under_the_name_it_had() -> None:
+    def changed(then: Any, now: Any, **kept: Any) -> dict[str, tuple[Any, Any]]:
+        return differing_keys({"data": {"sources": then, **kept}}, {"data": {"sources": now}})
+
+    digests: dict[str, Any] = {"content": ["a"], "side_files": [{}]}
+    for spelled in ("/a/mm", ["/a/mm/"], ["/b/mm"], [{"root": "/b/mm_moved", "name": "mm"}]):
+        assert changed(["/a/mm"], spelled, **digests) == {}, spelled
+    moved = [{"root": "/b/mm", "exec_starts": "/b/starts.json"}]
+    assert changed([{"root": "/a/mm", "exec_starts": "/a/starts.json"}], moved, **digests) == {}
+    # the split goes by the name
+    renamed = {"data.sources.0.name": ("mm", "other")}
+    assert changed(["/a/mm"], ["/a/other"], **digests) == renamed
+    assert changed(["/a/mm"], ["/a/mm", "/a/mn"], **digests) == {
+        "data.sources.1.name": (None, "mn")
+    }
+    # the embedded sample has a held-out episode of its own
+    assert changed(["sample"], ["/a/sample"], **digests).keys() == {"data.sources.0.root"}
+    # earlier versions kept no digests
+    assert changed(["/a/mm"], ["/a/mm/"]) == {}
+    assert changed(["/a/mm"], ["/b/mm"]) == {"data.sources.0.root": ("/a/mm", "/b/mm")}
+
+
 def test_auto_resumes_the_newest_unfinished_run_or_begins(two_steps: Path, tmp_path: Path) -> None:
     config = {"train": {**RECIPE, "steps": 9}, "seed": 1}
     assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
     shutil.copytree(two_steps, tmp_path / "a")
     assert open_run(tmp_path / "b", "auto", config).folder == tmp_path / "a"
+    with pytest.raises(UserError, match=r"seed: 1 then, 2 now(.|\n)*resume=auto chose that run"):
+        open_run(tmp_path / "b", "auto", {**config, "seed": 2})
+    assert open_run(tmp_path / "b", "auto", config, named=True) == Run(tmp_path / "b")
+    assert open_run(tmp_path / "a", "auto", config, named=True).step == 2
     (tmp_path / "a" / "summary.json").write_text("{}")
     assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
 

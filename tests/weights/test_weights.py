@@ -238,6 +238,14 @@ def test_a_memory_of_the_user_starts_from_a_released_base(
 # Statistics
 
 
+@pytest.mark.parametrize("fmt", FORMATS)
+def test_statistics_come_with_the_weights_that_this_library_writes(
+    fmt: str, bases: dict[str, Path]
+) -> None:
+    loaded = load_weights(build_policy("pi05"), bases[fmt])
+    assert loaded.require_processor().require_stats().to_dict() == unit_stats().to_dict()
+
+
 def test_of_several_datasets_statistics_none_is_taken_with_a_report(
     bases: dict[str, Path], tmp_path: Path
 ) -> None:
