@@ -93,14 +93,18 @@ def injection_of(
         hidden: no other block may attend to memory.
     """
     names = {block.name for block in blocks}
-    seen = set(names)
+    visible = set(names)
     if memory is not None:
         mask = torch.ones(memory.shape[:2], dtype=torch.bool)
         mask[:, -1] = False
         blocks = [Block("memory", memory, mask, blocks[0].expert), *blocks]
         if not hidden:
-            seen.add("memory")
-    visibility = {**dict.fromkeys(names, seen), "memory": {"memory"}, "action": seen | {"action"}}
+            visible.add("memory")
+    visibility = {
+        **dict.fromkeys(names, visible),
+        "memory": {"memory"},
+        "action": visible | {"action"},
+    }
     return Injection(blocks, visibility)
 
 
@@ -189,8 +193,8 @@ def check_rows(backbone: Backbone, batch: Batch, noise: Noise, loss: Tensor) -> 
     mode = "in training mode, " if backbone.training else ""
     for row in range(2):
         rows = slice(row, row + 1)
-        own_noise = {name: value[rows] for name, value in noise.items()}
-        alone = _loss(backbone, batch.rows(rows), own_noise)
+        row_noise = {name: value[rows] for name, value in noise.items()}
+        alone = _loss(backbone, batch.rows(rows), row_noise)
         error = float((alone - loss[rows]).abs().max())
         assert error <= TOLERANCE, (
             f"{mode}beside another sample the loss differs by {error:.2g}: compute each sample by"
@@ -215,8 +219,8 @@ def check_sample(backbone: Backbone, batch: Batch) -> None:
     )
     for row in range(2):
         rows = slice(row, row + 1)
-        own_noise = {name: value[rows] for name, value in noise.items()}
-        alone = _sample(backbone, batch.rows(rows), own_noise)
+        row_noise = {name: value[rows] for name, value in noise.items()}
+        alone = _sample(backbone, batch.rows(rows), row_noise)
         error = float((alone - chunk[rows]).abs().max())
         assert error <= TOLERANCE, (
             f"beside another sample the chunk differs by {error:.2g}: compute each sample by"

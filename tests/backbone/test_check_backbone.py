@@ -69,8 +69,8 @@ class NoTable(Mistaken):
 
 class NoImageMask(Mistaken):
     def embed(self, batch: Batch) -> list[Block]:
-        shown = replace(batch, image_mask=torch.ones_like(batch.image_mask))
-        return super().embed(shown)  # type: ignore[misc]
+        unmasked = replace(batch, image_mask=torch.ones_like(batch.image_mask))
+        return super().embed(unmasked)  # type: ignore[misc]
 
 
 class ImagesChanged(Mistaken):

@@ -29,7 +29,7 @@ def encoded_by(change: Change) -> dict[str, Any]:
     return {"forward": forward}
 
 
-def chosen_by(
+def selected_by(
     change: Callable[..., np.ndarray], kind: type[MemoryModule] = FrameSamp
 ) -> dict[str, Any]:
     """A `select` that changes what a memory of the library chooses."""
@@ -105,28 +105,30 @@ def aged(change: Callable[[torch.Tensor], torch.Tensor | None]) -> dict[str, Any
 
 
 def of_first_episode(
-    memory: Any, history: Any, step: int, rng: Any, chosen: np.ndarray
+    memory: Any, history: Any, step: int, rng: Any, selection: np.ndarray
 ) -> np.ndarray:
-    return memory.__dict__.setdefault("choices", {}).setdefault(step, chosen)
+    return memory.__dict__.setdefault("choices", {}).setdefault(step, selection)
 
 
 def reused_buffer_of_the_future(
-    memory: Any, history: History, step: int, rng: Any, chosen: np.ndarray
+    memory: Any, history: History, step: int, rng: Any, selection: np.ndarray
 ) -> np.ndarray:
     buffer = memory.__dict__.setdefault("buffer", np.zeros((1, 2), np.int64))
     buffer[0] = min(len(history) - 1, step) - len(history) % 2, 0
     return np.maximum(buffer, 0, out=buffer)
 
 
-def halved(memory: Any, history: History, step: int, rng: Any, chosen: np.ndarray) -> np.ndarray:
+def halved(memory: Any, history: History, step: int, rng: Any, selection: np.ndarray) -> np.ndarray:
     history.scores.until(step).values[:] *= 0.5
-    return chosen
+    return selection
 
 
-def random_rows(memory: Any, history: Any, step: int, rng: Any, chosen: np.ndarray) -> np.ndarray:
+def random_rows(
+    memory: Any, history: Any, step: int, rng: Any, selection: np.ndarray
+) -> np.ndarray:
     if rng is None:
-        return chosen
-    return chosen[np.sort(np.random.permutation(len(chosen))[: -(-len(chosen) // 2)])]
+        return selection
+    return selection[np.sort(np.random.permutation(len(selection))[: -(-len(selection) // 2)])]
 
 
 def drift(memory: Any, history: History, stream: Any) -> bool:
@@ -148,18 +150,20 @@ class BatchNormed(FrameSamp):
 MISTAKES: dict[str, tuple[Any, str]] = {
     "row 0 has row 1's tokens": (encoded_by(with_second_row), "^beside another sample .* other"),
     "choices of the first episode": (
-        {"selected_frames": None, **chosen_by(of_first_episode, TokenDrop)},
+        {"selected_frames": None, **selected_by(of_first_episode, TokenDrop)},
         "in a second episode select chose otherwise",
     ),
     "a later frame with rng": (
-        chosen_by(lambda m, h, step, rng, chosen: chosen + np.array([rng is not None, 0])),
+        selected_by(lambda m, h, step, rng, selection: selection + np.array([rng is not None, 0])),
         "with rng, at step 0 select chose frame 1, which is later",
     ),
     "unsorted with rng": (
-        chosen_by(lambda m, h, step, rng, chosen: chosen if rng is None else chosen[::-1]),
+        selected_by(
+            lambda m, h, step, rng, selection: selection if rng is None else selection[::-1]
+        ),
         "with rng, at step 1 the selection is not in time order",
     ),
-    "global random numbers": (chosen_by(random_rows), "draw from rng alone"),
+    "global random numbers": (selected_by(random_rows), "draw from rng alone"),
     "prepare changes tokens": ({"prepare": drift}, "`encode` gives other tokens"),
     "prepare without end": (
         {"prepare": lambda memory, history, stream: True},
@@ -209,7 +213,7 @@ MISTAKES: dict[str, tuple[Any, str]] = {
         "ages are in another order",
     ),
     "step changed": (encoded_by(next_step), "forward changed history.step in place"),
-    "scores changed": (chosen_by(halved, TokenDrop), "changed history.scores in place"),
+    "scores changed": (selected_by(halved, TokenDrop), "changed history.scores in place"),
     "weights without gradients": (encoded_by(idle_weights), "no gradient reaches"),
     "tokens detached": (
         encoded_by(lambda m, h, tokens: replace(tokens, tokens=tokens.tokens.detach())),
@@ -232,13 +236,13 @@ MISTAKES: dict[str, tuple[Any, str]] = {
         losing(lambda history: history.mask.sum(1).float(), "action"),
         "logged as `action`",
     ),
-    "one buffer": (chosen_by(reused_buffer_of_the_future), "frames after step .* changed"),
+    "one buffer": (selected_by(reused_buffer_of_the_future), "frames after step .* changed"),
     "fails on bfloat16": (encoded_by(refuse_bfloat16), "with bfloat16 features.*forward fails"),
     "zero on bfloat16": (encoded_by(zero_of_bfloat16), "with bfloat16 features.*other tokens"),
     "float16 tokens": (encoded_by(unlike_float32(torch.float16)), "got torch.float16"),
     "float64 tokens": (encoded_by(unlike_float32(torch.float64)), "got torch.float64"),
     "uint8 indices": (
-        chosen_by(lambda m, h, step, rng, chosen: chosen.astype(np.uint8)),
+        selected_by(lambda m, h, step, rng, selection: selection.astype(np.uint8)),
         "select must return int64; at step 0 it gave uint8",
     ),
 }
