@@ -158,7 +158,8 @@ class FrameBatch:
 class HistoryTokens(TensorStruct):
     """Selected past vision tokens, zero-padded.
 
-    features: [b, n, d_vision]; pooled vision tokens.
+    features: [b, n, d_vision]; pooled vision tokens as stored: bfloat16 unless
+        `policy.history_dtype` is another.
     positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's
         first, video included, the rest patch centres in sixteenths of a view's side.
     mask: [b, n] bool; False on padding.

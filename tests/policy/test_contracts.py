@@ -108,7 +108,9 @@ class _Dices(FrameSamp):
 class _ReadsPadding(FrameSamp):
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         tokens = super().forward(history)
-        return MemoryTokens(tokens.tokens + history.features.mean(), tokens.mask)
+        return MemoryTokens(
+            tokens.tokens + history.features.mean((1, 2), keepdim=True), tokens.mask
+        )
 
 
 class _Forgets(FrameSamp):
