@@ -131,12 +131,12 @@ def main(cfg: DictConfig) -> None:
     name = str(inspection.memory["name"])
     try:
         image = draw_memory(source, episode, step, memory, name, Path(inspection.output), console)
-        shown = str(image)
+        text = str(image)
     except UserError as error:
         if words_of("memory"):
             raise
-        shown = f"none of memory={name}, the default. {error}"
-    console.print(f"image: {shown}", highlight=False, soft_wrap=True)
+        text = f"none of memory={name}, the default. {error}"
+    console.print(f"image: {text}", highlight=False, soft_wrap=True)
 
 
 def show_self_check(inspection: Inspection, console: Console) -> None:

@@ -86,14 +86,14 @@ def name_composition(cfg: DictConfig, overrides: Iterable[str]) -> DictConfig:
     Changed in place, and returned.
     """
     keys = {word.lstrip("+").partition("=")[0] for word in overrides}
-    is_chosen = bool(keys & {"memory", "memory.name", "integration", "integration.name"})
-    if not is_chosen or keys & {"model", "name"} or cfg.get("name") != DEFAULT_MODEL:
+    has_parts = bool(keys & {"memory", "memory.name", "integration", "integration.name"})
+    if not has_parts or keys & {"model", "name"} or "name" not in cfg or cfg.name != DEFAULT_MODEL:
         return cfg
-    memory = cfg.get("memory") or {}
+    memory = cfg.memory or {}
     names = []
     for member in memory.get("members") or [memory]:
         names.append(member.get("name") if isinstance(member, Mapping) else member)
-    parts = ["+".join(filter(None, names)), (cfg.get("integration") or {}).get("name")]
+    parts = ["+".join(filter(None, names)), (cfg.integration or {}).get("name")]
     cfg.name = "_".join(filter(None, parts)) or "memoryless"
     return cfg
 

@@ -181,9 +181,9 @@ def check_vectors(root: Path, table: Any, name: str, width: int) -> tuple[np.nda
             wrong = ~is_finite.all(axis=1)
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
-            found = chunk[row].as_py()
-            value = brief(found)
-            if isinstance(found, list):
+            numbers = chunk[row].as_py()
+            value = brief(numbers)
+            if isinstance(numbers, list):
                 number = int(np.argmin(is_finite[row]))  # the first that is not
                 value = f"{values[row, number]} for number {number + 1}"
             raise UserError(

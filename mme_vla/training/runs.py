@@ -135,16 +135,16 @@ def open_run(
         )
         return Run(folder)
     if resume == "auto":
-        own = checkpoints_in(folder / CHECKPOINTS)
-        newest = own[-1] if own else None
-        if not own and not named:
+        checkpoints = checkpoints_in(folder / CHECKPOINTS)
+        newest = checkpoints[-1] if checkpoints else None
+        if not checkpoints and not named:
             newest = _unfinished_beside(folder)
         if newest is None:
             return Run(folder)
         try:
             return open_run(folder, str(newest), config)
         except UserError as error:
-            if own:
+            if checkpoints:
                 raise
             raise UserError(
                 f"{error}\nresume=auto chose that run, the newest unfinished one in"
@@ -259,14 +259,14 @@ def _named_sources(config: dict[str, Any], began_with: Collection[str]) -> dict[
         return config
     sources = {}
     for number, entry in enumerate(listed_sources(data["sources"])):
-        section = {"name": entry.short_name}
+        source = {"name": entry.short_name}
         root = SAMPLE if entry.root == "sample" else Path(entry.root).expanduser().resolve()
         # the embedded sample holds out an episode of its own
         if "content" not in began_with or root == SAMPLE:
-            section["root"] = str(root)
+            source["root"] = str(root)
         if "side_files" not in began_with and entry.exec_starts is not None:
-            section["exec_starts"] = str(Path(entry.exec_starts).resolve())
-        sources[str(number)] = section
+            source["exec_starts"] = str(Path(entry.exec_starts).resolve())
+        sources[str(number)] = source
     return {**config, "data": {**data, "sources": sources}}
 
 

@@ -167,7 +167,7 @@ def test_rows_of_memory_tokens_are_rows_of_their_losses() -> None:
     assert memory.rows(torch.tensor([2, 0])).losses["x"].tolist() == [2, 0]
 
 
-def test_words_of_a_prompt_that_is_padded_on_the_left_are_kept(policy: MMEPolicy) -> None:
+def test_words_of_a_prompt_that_is_padded_on_the_left_stay(policy: MMEPolicy) -> None:
     batch = random_batch(policy)
     batch.prompt_mask[:] = False
     batch.prompt_mask[:, -10:] = True

@@ -274,19 +274,19 @@ def test_copies_of_an_episode_share_its_policy_and_nothing_else(model):
     assert beside.policy is other is not policy
 
 
-def test_an_episode_keeps_what_its_caller_writes_over():
+def test_an_episode_does_not_share_arrays_with_its_caller():
     policy = small_policy("pi05", backbone=FEW_TOKENS, processor={"prompt": "past_actions"})
     frames = moving_frames(4, size=policy.backbone.image_size)
     views = {"front": frames, "wrist": frames}
     states = np.zeros((4, 8), np.float32)
     chunks = []
-    for writes in (False, True):
+    for reuses in (False, True):
         episode = policy.start_episode("press the button")
         episode.observe(views, states)
         chunk = policy.act(episode)
         prefix = chunk[4:8].copy()
         episode.set_action_prefix(prefix, np.int64(2))
-        if writes:
+        if reuses:
             chunk[:] = prefix[:] = 9.0
         episode.observe(views, states)
         chunks.append(policy.act(episode))

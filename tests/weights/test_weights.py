@@ -239,9 +239,7 @@ def test_a_memory_of_the_user_starts_from_a_released_base(
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
-def test_statistics_come_with_the_weights_that_this_library_writes(
-    fmt: str, bases: dict[str, Path]
-) -> None:
+def test_statistics_come_with_the_weights_of_this_library(fmt: str, bases: dict[str, Path]) -> None:
     loaded = load_weights(build_policy("pi05"), bases[fmt])
     assert loaded.require_processor().require_stats().to_dict() == unit_stats().to_dict()
 

@@ -181,7 +181,7 @@ class Swap:
         return VisibleFact(" and ".join(names), frozenset(names), replaces=True)
 
 
-def swaps_in_turn(
+def consecutive_swaps(
     pairs: Sequence[tuple[Thing, Thing | None]],
     group: Sequence[Thing],
     start: int,

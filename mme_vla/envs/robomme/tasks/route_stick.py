@@ -87,8 +87,8 @@ class RouteStick(Task):
 
         self.route = [self.discs[i] for i in route]
         self.directions: list[Direction] = values.words("actions.turns", sample, TURNS)  # type: ignore[assignment]
-        turns = len(self.directions)
-        values.require(turns == moves, "actions.turns", f"has {turns} turns for {moves} moves")
+        count = len(self.directions)
+        values.require(count == moves, "actions.turns", f"has {count} turns for {moves} moves")
 
     def _sample_route(self, draws: Draws) -> list[int]:
         low, high = MOVES[self.difficulty]

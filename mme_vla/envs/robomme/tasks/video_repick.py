@@ -12,8 +12,8 @@ from mme_vla.envs.robomme.scene.motions import (
     Cue,
     Swap,
     active_motions,
+    consecutive_swaps,
     row,
-    swaps_in_turn,
     tally,
     under,
 )
@@ -130,7 +130,7 @@ class VideoRepick(Task):
 
     def before_physics(self, k: int) -> None:
         if self._swaps_due and not self.swaps:
-            self.swaps = swaps_in_turn(self.swapped, self.cubes, start=k)
+            self.swaps = consecutive_swaps(self.swapped, self.cubes, start=k)
             self.motions = [*self.swaps]
         super().before_physics(k)
 

@@ -17,7 +17,7 @@ from mme_vla.envs.robomme.scene.motions import (
     Hide,
     Swap,
     active_motions,
-    swaps_in_turn,
+    consecutive_swaps,
     under,
 )
 from mme_vla.envs.robomme.scene.objects import (
@@ -370,7 +370,7 @@ class UnmaskSwap(ContainerTask):
     def start_episode(self, draws: Draws) -> None:
         inner, outer = self.containers, self.outer.containers
         start, steps, end = COVER_STEPS, self.swap_steps, self.swapped_after
-        swaps = swaps_in_turn(self.swapped, inner, start, steps)
+        swaps = consecutive_swaps(self.swapped, inner, start, steps)
         cover = Cover(inner, self.parking_group("inner"), self.contents)
         pairs = list(zip(self.cubes, self.over_cubes, strict=True))
         self.visible_motions: list[Cover | Swap] = [cover, *swaps]
@@ -378,7 +378,7 @@ class UnmaskSwap(ContainerTask):
             cover,
             Cover(outer, self.parking_group("outer")),
             *swaps,
-            *swaps_in_turn(self.outer_swapped, outer, start, steps),
+            *consecutive_swaps(self.outer_swapped, outer, start, steps),
             Hide(pairs, start, end, self.parking_group("inner cubes")),
             Hide(self.outer.hidden, start, end, self.parking_group("outer cubes")),
         ]
