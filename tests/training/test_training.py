@@ -185,7 +185,8 @@ def test_a_dataset_may_change_its_folder_under_its_name() -> None:
         return differing_keys({"data": {"sources": then, **others}}, {"data": {"sources": now}})
 
     digests: dict[str, Any] = {"content": ["a"], "side_files": [{}]}
-    for spelled in ("/a/mm", ["/a/mm/"], ["/b/mm"], [{"root": "/b/mm_new", "name": "mm"}]):
+    entry = {"root": "/b/mm_new", "name": "mm"}
+    for spelled in ("/a/mm", ["/a/mm/"], ["/b/mm"], [entry], entry):
         assert changed(["/a/mm"], spelled, **digests) == {}, spelled
     other = [{"root": "/b/mm", "exec_starts": "/b/starts.json"}]
     assert changed([{"root": "/a/mm", "exec_starts": "/a/starts.json"}], other, **digests) == {}
