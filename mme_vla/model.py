@@ -153,15 +153,7 @@ class MMEModel(nn.Module):
                 row a sample.
         """
         if memory is not None:
-            check_rows("MemoryTokens.tokens", memory.tokens, len(batch.prompt))
-            check_shape("MemoryTokens.mask", memory.mask, memory.tokens.shape[:2])
-        if memory is not None and self.memory is not None:
-            n_tokens = memory.tokens.shape[1]
-            if n_tokens > self.memory.budget:
-                raise ValueError(
-                    f"{type(self.memory).__name__} returned {n_tokens} memory tokens; its budget is"
-                    f" {self.memory.budget}."
-                )
+            check_tokens(memory, len(batch.prompt), self.memory)
         injection = self.integration.inject(self.backbone.embed(batch), memory)
         if "positions" not in self.backbone.supports:
             for block in injection.blocks:
@@ -311,6 +303,20 @@ def check_shape(what: str, values: Tensor | None, shape: Sequence[int]) -> None:
     """Raise an error unless a tensor, if there is one, has a shape."""
     if values is not None and values.shape != tuple(shape):
         raise ValueError(f"{what} has shape {list(values.shape)}: it must be {list(shape)}.")
+
+
+def check_tokens(tokens: MemoryTokens, samples: int, memory: MemoryModule | None) -> None:
+    """Raise an error unless memory tokens have one row a sample and are within the budget of the
+    memory, if there is one.
+    """
+    check_rows("MemoryTokens.tokens", tokens.tokens, samples)
+    check_shape("MemoryTokens.mask", tokens.mask, tokens.tokens.shape[:2])
+    n_tokens = tokens.tokens.shape[1]
+    if memory is not None and n_tokens > memory.budget:
+        raise ValueError(
+            f"{type(memory).__name__} returned {n_tokens} memory tokens; its budget is"
+            f" {memory.budget}."
+        )
 
 
 def check_noise(noise: Mapping[str, Tensor], samples: int) -> None:
