@@ -93,7 +93,7 @@ class Extension:
 
     parts: kind of `REGISTRIES` → name → module that registers it.
     commands: name → command.
-    configs: a folder of YAML files, searched after the library's (`config/composition.py`).
+    configs: a folder of YAML files, searched after the library's (`config/trees.py`).
     checkpoints: name → folder.
     weight_formats: name → format that `weights` reads and writes.
     owner: which package or extra this is, for messages; set where extensions are listed.

@@ -125,9 +125,9 @@ class FlowHead:
         return noise
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
-        """The loss [b, h] of chunks a [b, h, a]: with noise ε and flow times τ, the network reads
-        x_τ = τε + (1 − τ)a, and the loss of a step is the mean over its numbers of (v − u)², where
-        v = predict(x_τ, τ) and u = ε − a.
+        """The loss [b, h] of `actions` [b, h, a]: with noise ε and flow times τ, the network reads
+        x_τ = τε + (1 − τ)·actions, and the loss of a step is the mean over its numbers of (v − u)²,
+        where v = predict(x_τ, τ) and u = ε − actions.
         """
         x_t, target = interpolate(actions.float(), noise["noise"], noise["time"])
         return step_loss(predict(x_t, noise["time"]), target)

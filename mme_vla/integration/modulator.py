@@ -27,7 +27,7 @@ from mme_vla.types import MemoryTokens
 
 
 class ModulatorLayer(nn.Module):
-    """One layer's cross-attention on memory, and the linear map from its output to (a, β)."""
+    """One layer's cross-attention on memory, and the linear map from its output to (α, β)."""
 
     def __init__(
         self, width: int, heads: int, kv_heads: int, head_dim: int, exact_identity: bool
@@ -61,14 +61,16 @@ class ModulatorLayer(nn.Module):
         return self.out(attend(q, k, v, mask))
 
     def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor, rope: Rotation) -> Tensor:
-        """x̂ = x/rms(x)·(1 + a) + β with (a, β) = W r + b."""
-        a, beta = self.modulation(self.read_memory(x, k, v, mask, rope)).float().chunk(2, dim=-1)
+        """x̂ = x/rms(x)·(1 + α) + β with (α, β) = W r + b."""
+        alpha, beta = (
+            self.modulation(self.read_memory(x, k, v, mask, rope)).float().chunk(2, dim=-1)
+        )
         if self.exact_identity:
-            # The same direction at x's own size: the norm that follows removes it, and a = β = 0
+            # The same direction at x's own size: the norm that follows removes it, and α = β = 0
             # gives x to the bit.
             size = (x.float().square().mean(-1, keepdim=True) + EPS).sqrt()
-            return (x.float() * (1 + a) + size * beta).to(x.dtype)
-        return (rms_normalise(x) * (1 + a) + beta).to(x.dtype)
+            return (x.float() * (1 + alpha) + size * beta).to(x.dtype)
+        return (rms_normalise(x) * (1 + alpha) + beta).to(x.dtype)
 
 
 @INTEGRATIONS.register("modulator")

@@ -171,7 +171,7 @@ class MemoryModule(nn.Module):
         # Made on the device: nothing waits for a copy.
         mask = torch.ones(len(indices), dtype=torch.bool, device=device)
         time = torch.full((), int(history.times(np.array(step))), device=device)
-        selection = HistoryTokens(features, send(positions, device), mask, time)
+        selection = HistoryTokens(features, send(positions, device), mask, step=time)
         return pad_selection(selection, padded_length(self, len(indices)), bool(self.pad_left))
 
     def start_stream(self) -> Any:

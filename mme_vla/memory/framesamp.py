@@ -56,5 +56,7 @@ class FrameSamp(FrameMemory, PerceptualMemory):
         self.frames = frames
 
     def selected_frames(self, step: int, exec_start: int = 0) -> np.ndarray:
-        """The frames remembered at `step`: evenly spaced among those that are stored."""
+        """The frames remembered at `step`: evenly spaced among those that are stored, wherever the
+        execution starts.
+        """
         return evenly_spaced_stored_frames(self.storage, step, self.frames)

@@ -310,8 +310,8 @@ class Policy(nn.Module):
                 policy is made for it, else float32.
             revision: branch, tag or commit of the repository.
             token: for private repositories.
-            trust_plugins: import the modules that the checkpoint names under `plugins`. They run
-                code of its author.
+            trust_plugins: import the modules that the checkpoint names under `plugins`, and those
+                of parts of installed packages. They run code of their authors.
             tokenizer: in place of the checkpoint's own, which is fetched from the hub only if it is
                 π0.5's.
             policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers import autocast
+from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
@@ -123,8 +124,13 @@ class NetworkPolicy(Policy):
     def full_batch(self, device: torch.device | str = "cpu") -> Any:
         """A batch of one at its fullest: every view, the longest prompt, a full memory, actions to
         learn from.
+
+        Raises:
+            UserError: this kind of policy makes none, so its cost cannot be counted.
         """
-        raise NotImplementedError
+        raise UserError(
+            f"{type(self).__name__} has no full_batch(), which `mme-vla analyse cost` counts."
+        )
 
     def warm_up_vision(self) -> None:
         """Run the vision tower on one black memory frame."""

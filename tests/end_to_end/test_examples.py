@@ -208,3 +208,6 @@ def test_the_shortest_method_and_its_command_work(installed: str, tmp_path: Path
     words = ("train", "model=one_layer", *BRIEF[:-1], *recomputing)
     done = commands.run("mme_vla", *words, cwd=tmp_path, env=env)
     assert done.returncode != 0 and "OneLayer cannot recompute activations" in done.stderr
+    words = ("analyse", "cost", "--models", "one_layer")
+    done = commands.run("mme_vla", *words, cwd=tmp_path, env=env)
+    assert done.returncode != 0 and "OneLayer has no full_batch()" in done.stderr

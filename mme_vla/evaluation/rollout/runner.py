@@ -179,8 +179,8 @@ class Rollout:
         self.envs.start(worker, job, images=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
-        """Give a worker's reply to its episode: finish it, restart it for images, or have the
-        policy observe its frames.
+        """Give a worker's reply to its episode: finish it, restart it for images, or queue its
+        frames to be read.
         """
         running = self._running[reply.worker]
         self._scheduler.later.pop(running, None)
@@ -294,7 +294,7 @@ class Rollout:
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
     ) -> None:
-        """End an episode and let its worker begin another."""
+        """End an episode, have `on_end` write its record, and let its worker begin another."""
         outcome = status
         if status not in ("success", "fail", "timeout"):
             outcome = "error"

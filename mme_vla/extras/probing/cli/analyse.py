@@ -247,7 +247,13 @@ def cost(args: argparse.Namespace) -> None:
     costs = []
     rows = []
     for model in models:
-        counts = count_model(model, backbone=args.backbone)
+        try:
+            counts = count_model(model, backbone=args.backbone)
+        except UserError as error:
+            if args.models:
+                raise
+            print(f"{model}: not counted. {error}")  # of an installed package
+            continue
         costs.append(counts)
         rows.append(
             [
