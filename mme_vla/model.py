@@ -191,16 +191,10 @@ class MMEModel(nn.Module):
         check_rows(f"{type(self.backbone).__name__}.loss", step_losses, len(batch.prompt))
         action = masked_mean(step_losses, batch.action_mask, batch.weight)
 
-        auxiliary: dict[str, Tensor] = {}
-        if memory is not None and self.training:
-            for name, values in memory.losses.items():
-                check_auxiliary(name, values, len(batch.prompt))
-                auxiliary[name] = weighted_mean(values.float(), batch.weight)
-        if self.training:
-            for name in self.loss_weights:
-                check_known("auxiliary loss in train.losses:", name, list(auxiliary))
-
         total = action
+        auxiliary: dict[str, Tensor] = {}
+        if self.training:
+            auxiliary = self.auxiliary_losses(memory, batch)
         for name, value in auxiliary.items():
             weight = self.loss_weights.get(name, 1.0)
             if weight:  # 0 leaves one out
@@ -214,6 +208,22 @@ class MMEModel(nn.Module):
             if memory is not None:
                 metrics |= memory.logged()
         return total
+
+    def auxiliary_losses(self, memory: MemoryTokens | None, batch: Batch) -> dict[str, Tensor]:
+        """Means over a batch of the losses that memory tokens bring, unweighted.
+
+        Raises:
+            UserError: `loss_weights` names another one.
+            ValueError: one has not one number a sample.
+        """
+        losses: dict[str, Tensor] = {}
+        if memory is not None:
+            for name, values in memory.losses.items():
+                check_auxiliary(name, values, len(batch.prompt))
+                losses[name] = weighted_mean(values.float(), batch.weight)
+        for name in self.loss_weights:
+            check_known("auxiliary loss in train.losses:", name, list(losses))
+        return losses
 
     def forward(
         self,
