@@ -1,8 +1,10 @@
 """`check_backbone`: does a backbone take memory, train and sample as the library expects?"""
 
 import re
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -172,7 +174,7 @@ def check_loss(backbone: Backbone, batch: Batch) -> None:
     error = float((_loss(backbone, other, noise) - loss).abs().max())
     assert error <= TOLERANCE, f"tokens in the prompt's padding changed the loss by {error:.2g}."
     check_views(backbone, batch, noise)
-    check_rows(backbone, batch, noise, loss)
+    check_rows(partial(_loss, backbone), batch, noise, "loss")
 
 
 def check_views(backbone: Backbone, batch: Batch, noise: Noise) -> None:
@@ -188,16 +190,17 @@ def check_views(backbone: Backbone, batch: Batch, noise: Noise) -> None:
     )
 
 
-def check_rows(backbone: Backbone, batch: Batch, noise: Noise, loss: Tensor) -> None:
-    """Every sample has the loss that it has alone."""
-    mode = "in training mode, " if backbone.training else ""
+def check_rows(
+    compute: Callable[[Batch, Noise], Tensor], batch: Batch, noise: Noise, what: str
+) -> None:
+    """Every sample has the loss, or the chunk, that it has alone."""
+    together = compute(batch, noise)
     for row in range(2):
         rows = slice(row, row + 1)
         row_noise = {name: value[rows] for name, value in noise.items()}
-        alone = _loss(backbone, batch.rows(rows), row_noise)
-        error = float((alone - loss[rows]).abs().max())
+        error = float((compute(batch.rows(rows), row_noise) - together[rows]).abs().max())
         assert error <= TOLERANCE, (
-            f"{mode}beside another sample the loss differs by {error:.2g}: compute each sample by"
+            f"beside another sample the {what} differs by {error:.2g}: compute each sample by"
             " itself, without means over the batch."
         )
 
@@ -217,15 +220,7 @@ def check_sample(backbone: Backbone, batch: Batch) -> None:
     assert not torch.equal(chunk, other), (
         "other images give the same chunk: the observation does not reach the actions."
     )
-    for row in range(2):
-        rows = slice(row, row + 1)
-        row_noise = {name: value[rows] for name, value in noise.items()}
-        alone = _sample(backbone, batch.rows(rows), row_noise)
-        error = float((alone - chunk[rows]).abs().max())
-        assert error <= TOLERANCE, (
-            f"beside another sample the chunk differs by {error:.2g}: compute each sample by"
-            " itself, without means over the batch."
-        )
+    check_rows(partial(_sample, backbone), batch, noise, "chunk")
 
 
 @torch.no_grad()
@@ -305,7 +300,7 @@ def check_training(backbone: Backbone, batch: Batch, unused: str | None) -> None
         loss = _loss(backbone, batch, noise)
         # A backbone may draw numbers in training, as dropout does.
         if torch.equal(loss, _loss(backbone, batch, noise)):
-            check_rows(backbone, batch, noise, loss)
+            check_rows(partial(_loss, backbone), batch, noise, "loss in training mode")
     loss = _loss(backbone, batch, noise)
     assert loss.requires_grad, "the loss has no gradient: compute it without no_grad or detach()."
     loss.mean().backward()

@@ -97,7 +97,7 @@ class SpareLayer(Mistaken):
         (NextImageTokens, "image's tokens depend on its batch"),
         (ConstantChunk, "other images give the same chunk"),
         (BatchMean, "^beside another sample the loss differs"),
-        (BatchMeanInTraining, "in training mode, beside another sample the loss differs"),
+        (BatchMeanInTraining, "beside another sample the loss in training mode differs"),
         (DroppedMemory, "an injected block does not change the loss"),
         (NoTable, r"a block that injection\.visibility hides changed the loss"),
         (NoImageMask, "a view that image_mask hides changed the loss"),
