@@ -317,6 +317,12 @@ class KVCache:
     spans: list[Span]
     mask: Tensor  # [b, past] bool
 
+    def after(self, layout: Layout) -> "KVCache":
+        """The cache behind a pass with this layout, which has written its keys and values."""
+        tokens = layout.valid.shape[1] - self.mask.shape[1]
+        layers = [layer._replace(start=layer.start + tokens) for layer in self.layers]
+        return KVCache(layers, layout.spans, layout.valid)
+
 
 @dataclass
 class TimeModulations:
@@ -396,8 +402,7 @@ class JointTransformer(nn.Module):
         condition: Tensor | TimeModulations | None = None,
         hook: Hook | None = None,
         past: KVCache | None = None,
-        keep: bool = False,
-    ) -> tuple[Tensor | None, KVCache | None]:
+    ) -> Tensor | None:
         """Run blocks, after those of `past`.
 
         Args:
@@ -406,23 +411,17 @@ class JointTransformer(nn.Module):
             condition: time condition [b, c] of the action expert, or its modulations; unread
                 without that expert.
             hook: the per-layer hook.
-            past: an earlier pass's cache, or `cache_space`.
-            keep: whether to return a cache of `past` and this pass; `past` must be given.
+            past: `cache_space`, or what an earlier pass left in it (`KVCache.after`). This pass
+                writes its keys and values behind those.
 
         Returns:
-            The output [b, n, d] of the action expert's last block (None if it is not among
-            `blocks`) and the cache (None unless kept).
+            The output [b, n, d] of the action expert's last block; None if it is not among
+            `blocks`.
         """
         segments = _segments(blocks, layout.dtype, self._compiled)
         is_compiled = self._compiled and not torch.is_grad_enabled()
-        if is_compiled and not isinstance(condition, Tensor):  # while sampling: sums are deferred
-            # With updates of zeros, the first layer shares the compiled code of the others.
-            for i, segment in enumerate(segments):
-                gate = None
-                if segment.expert == self.action_expert and condition is not None:
-                    gate = condition.final.gate  # of any value; this is no other input of the layer
-                zeros = torch.zeros_like(segment.tokens)
-                segments[i] = segment._replace(update=zeros, gate=gate)
+        if is_compiled and not isinstance(condition, Tensor):  # while sampling
+            self._defer_sums(segments, condition)
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, TimeModulations) else condition
             segments = run_layer(
@@ -435,25 +434,30 @@ class JointTransformer(nn.Module):
                 None if past is None else past.layers[i],
                 how=self.gradient_checkpointing,
             )
-        output = None
-        if segments:
-            final = condition.final if isinstance(condition, TimeModulations) else condition
-            output = self.read_out(self.final_norm, segments[-1], final)
-        if not keep:
-            return output, None
-        assert past is not None, "keep=True needs a past with space: see cache_space()."
-        tokens = sum(len(block) for block in blocks)
-        layers = [layer._replace(start=layer.start + tokens) for layer in past.layers]
-        return output, KVCache(layers, layout.spans, layout.valid)
+        if not segments:
+            return None
+        final = condition.final if isinstance(condition, TimeModulations) else condition
+        return self.read_out(self.final_norm, segments[-1], final)
 
     # Sampling
+
+    def _defer_sums(self, segments: list[Segment], condition: TimeModulations | None) -> None:
+        """Let the layers defer their sums (`JointBlock.forward`).
+
+        With updates of zeros, the first layer shares the compiled code of the others.
+        """
+        for i, segment in enumerate(segments):
+            gate = None
+            if segment.expert == self.action_expert and condition is not None:
+                gate = condition.final.gate  # of any value; this is no other input of the layer
+            zeros = torch.zeros_like(segment.tokens)
+            segments[i] = segment._replace(update=zeros, gate=gate)
 
     def cache_space(self, blocks: Sequence[Block], following: int) -> KVCache:
         """An empty cache with space for a pass over `blocks`, and behind them for every one of many
         passes of `following` tokens.
 
-        The space behind them is for one pass at a time: no such pass can be kept (`forward`), and
-        each overwrites the last.
+        The space behind them is for one pass at a time: each overwrites the last.
         """
         tokens = sum(len(block) for block in blocks) + following
         first = blocks[0].tokens

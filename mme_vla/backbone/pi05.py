@@ -167,7 +167,7 @@ class Pi05Backbone(
         condition = self.time_condition(time)
         if injection.condition is not None:
             condition = injection.condition(condition)
-        hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
+        hidden = self.transformer(blocks, layout, condition, injection.hook)
         return self.project_actions(hidden)
 
     def action_block(self, x_t: Tensor) -> Block:
@@ -220,7 +220,8 @@ class Pi05Backbone(
         step_length = sum(len(block) for block in step_blocks)
         space = self.transformer.cache_space(injection.blocks, step_length)
         prefix_layout = self.transformer.layout(injection.blocks, injection.visibility)
-        _, prefix = self.transformer(injection.blocks, prefix_layout, past=space, keep=True)
+        self.transformer(injection.blocks, prefix_layout, past=space)
+        prefix = space.after(prefix_layout)
 
         # What all steps share: mask and angles, and the time modulations of every layer.
         step_layout = self.transformer.layout(step_blocks, injection.visibility, prefix)
@@ -238,7 +239,7 @@ class Pi05Backbone(
             # Its keys and values go behind the prefix, where the next step overwrites them.
             blocks = [*injection.beside, self.action_block(x_t)]
             condition = modulations.at(index, rows)
-            hidden, _ = self.transformer(blocks, step_layout, condition, injection.hook, prefix)
+            hidden = self.transformer(blocks, step_layout, condition, injection.hook, prefix)
             return self.project_actions(hidden)
 
         velocity = self.head.velocity(predict_at, times, noise)

@@ -54,7 +54,7 @@ def test_the_backbone_reads_coordinates_of_image_tokens() -> None:
 
     def velocity(positions: Tensor | None) -> Tensor:
         blocks = [replace(images, positions=positions), *others]
-        hidden, _ = policy.backbone.transformer(  # type: ignore[operator]
+        hidden = policy.backbone.transformer(  # type: ignore[operator]
             [*blocks, policy.backbone.action_block(chunk)],  # type: ignore[operator]
             policy.backbone.transformer.layout(
                 [*blocks, policy.backbone.action_block(chunk)], injection.visibility

@@ -62,7 +62,7 @@ def test_cached_prefix_equals_the_joint_pass(policy):
     transformer = policy.backbone.transformer
     layout = transformer.layout([action], policy.integration.visibility, prefix)
     condition = policy.backbone.time_condition(time_)
-    hidden, _ = transformer([action], layout, condition, injection.hook, prefix)
+    hidden = transformer([action], layout, condition, injection.hook, prefix)
     cached = policy.backbone.project_actions(hidden)
     assert (cached - policy.predict(batch, noise, time_)).abs().max() < TOLERANCE
 
@@ -193,8 +193,8 @@ def prefill(policy, batch):
     transformer = policy.backbone.transformer
     layout = transformer.layout(injection.blocks, injection.visibility)
     space = transformer.cache_space(injection.blocks, policy.horizon)
-    _, prefix = transformer(injection.blocks, layout, past=space, keep=True)
-    return prefix, injection
+    transformer(injection.blocks, layout, past=space)
+    return space.after(layout), injection
 
 
 @torch.no_grad()

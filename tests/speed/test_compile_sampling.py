@@ -41,7 +41,8 @@ def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> T
     injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     before = backbone.transformer.layout(injection.blocks, injection.visibility)
     space = backbone.transformer.cache_space(injection.blocks, 0)
-    _, prefix = backbone.transformer(injection.blocks, before, past=space, keep=True)
+    backbone.transformer(injection.blocks, before, past=space)
+    prefix = space.after(before)
     prefix = replace(prefix, layers=[JoinedKV(*layer.past()) for layer in prefix.layers])
     layout = backbone.transformer.layout(
         [backbone.action_block(noise)], injection.visibility, prefix
@@ -51,9 +52,7 @@ def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> T
     x = noise
     for index in range(steps):
         action = [backbone.action_block(x)]
-        hidden, _ = backbone.transformer(
-            action, layout, conditions.at(index), injection.hook, prefix
-        )
+        hidden = backbone.transformer(action, layout, conditions.at(index), injection.hook, prefix)
         x = x - backbone.project_actions(hidden) / steps
     return x
 
