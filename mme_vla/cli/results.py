@@ -235,8 +235,6 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
         numbers=numbers,
         errors=args.errors,
         confidence=args.confidence,
-        samples=args.samples,
-        seed=args.seed,
     )
 
 
@@ -244,7 +242,7 @@ def _check_views(args: argparse.Namespace) -> bool:
     """Whether a view is asked for; refuses two at once, and options that it would leave unused."""
     views = [f"--{name}" for name in ("stress", "events", "ood") if getattr(args, name)]
     require(len(views) < 2, f"{' and '.join(views)}: name one of them.")
-    names = ["csv", "latex", "compare", "all", "brief", "samples", "seed"]
+    names = ["csv", "latex", "compare", "all", "brief"]
     if args.stress:
         names.append("split")  # its curves are over splits
     default = _parser().get_default
@@ -502,8 +500,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--confidence", type=float, default=0.95, help="level of intervals and tests"
     )
-    parser.add_argument("--samples", type=int, default=10_000, help="of the bootstrap")
-    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
+    for name in ("--samples", "--seed"):  # of a bootstrap that earlier versions had; not read
+        parser.add_argument(name, type=int, help=argparse.SUPPRESS)
     parser.add_argument(
         "--demo", action="store_true", help="synthetic records with the paper's success rates"
     )

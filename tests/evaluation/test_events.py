@@ -477,7 +477,7 @@ def test_a_view_takes_the_tasks_episodes_and_split_that_are_named(
     capsys.readouterr()
     for wrong, message in (
         ("--events --tasks StopCub", "no task 'StopCub'"),
-        ("--events --all --samples 9", "--all and --samples: not with --events"),
+        ("--events --all --brief", "--all and --brief: not with --events"),
         ("--stress --split val", "--split: not with --stress"),
     ):
         with pytest.raises(SystemExit):

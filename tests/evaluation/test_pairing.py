@@ -37,7 +37,7 @@ from mme_vla.extras.trajectories.local import LocalEnvs
 
 HERE = ["a0", "a1", "a2", "a3"]
 THERE = ["a0", "b1", "a2", "b3"]
-PROTOCOL = Protocol(("PickXtimes",), episodes=4, samples=50)
+PROTOCOL = Protocol(("PickXtimes",), episodes=4)
 
 
 def named(run: Sequence[EpisodeRecord], scenes: Sequence[str | None]) -> list[EpisodeRecord]:
@@ -107,7 +107,7 @@ def test_two_methods_are_compared_on_the_scenes_that_both_machines_built(
     result = compare(first, second, PROTOCOL)
     assert (result.episodes, result.wins, result.losses, result.first_rate) == (2, 1, 0, 100.0)
     save_records(tmp_path, every)
-    main([str(tmp_path), "--tasks", "PickXtimes", "--episodes", "4", "--samples", "20", "--brief"])
+    main([str(tmp_path), "--tasks", "PickXtimes", "--episodes", "4", "--brief"])
     printed = capsys.readouterr().out
     assert "m − n: 2 episodes not paired, for the scenes are different ones" in printed
     assert "(PickXtimes 2)" in printed
@@ -141,8 +141,6 @@ def test_nothing_in_common_is_said_and_not_compared(
         "PickXtimes",
         "--episodes",
         "4",
-        "--samples",
-        "20",
         "--brief",
     ]
     main(options)
@@ -159,7 +157,7 @@ def test_pairs_without_digests_are_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_records(tmp_path, [*records("test", [1] * 4, "m"), *records("test", [0] * 4, "n")])
-    main([str(tmp_path), "--tasks", "PickXtimes", "--episodes", "4", "--samples", "20", "--brief"])
+    main([str(tmp_path), "--tasks", "PickXtimes", "--episodes", "4", "--brief"])
     assert "4 of 4 paired episodes have no digest of their scene" in capsys.readouterr().out
 
 

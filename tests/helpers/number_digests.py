@@ -38,7 +38,7 @@ def order() -> str:
 
 
 def bootstraps() -> str:
-    outcomes = np.random.default_rng(5).integers(0, 2, (2, 50, 3)).astype(float)
+    outcomes = np.random.default_rng(5).integers(0, 2, (2, 50)).astype(float)
     means = resampled_means({"one": [outcomes[0]], "two": [outcomes[1]]}, samples=1000, seed=3)
     return digest([means.tobytes()])
 

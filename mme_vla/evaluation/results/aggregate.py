@@ -39,7 +39,7 @@ from mme_vla.evaluation.results.scopes import (
     suites_of,
     tasks_of,
 )
-from mme_vla.evaluation.results.statistics import Interval, bootstrap, mean_interval, mean_std
+from mme_vla.evaluation.results.statistics import Interval, estimate, mean_interval, mean_std
 from mme_vla.policy.training_identity import TrainingIdentity, without_seed
 
 
@@ -461,11 +461,11 @@ def _figure(success: pd.DataFrame, method: Method, protocol: Protocol) -> Figure
     units = trainings if several else complete
     rates = units.groupby(level="task").mean().mean()
     mean, std = mean_std(list(rates))
-    interval = mean_interval(list(by_task(units).values()), protocol.confidence)
+    of_tasks = list(by_task(units).values())
+    interval = mean_interval(of_tasks, protocol.confidence)
     if several:
-        outcomes = {task: [values] for task, values in by_task(trainings).items()}
-        sampled = bootstrap(outcomes, protocol.confidence, protocol.samples, protocol.seed)
-        interval = interval.widen(sampled)
+        trained = estimate([of_tasks]).interval(protocol.confidence)
+        interval = interval.widen(trained.clip(0, 1))
     return Figure(
         100 * mean,
         None if std is None else 100 * std,

@@ -13,12 +13,10 @@ from mme_vla.evaluation.results.aggregate import Method, by_task
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import (
     Interval,
+    estimate,
     holm,
     paired_interval,
     paired_test,
-    percentiles,
-    resampled_means,
-    sampled_test,
     wins_losses,
 )
 
@@ -29,12 +27,12 @@ class Comparison:
 
     first_rate, second_rate, difference: means over tasks.
     first_solved, second_solved: of `episodes`, a mean over runs.
-    interval: of the difference (`paired_interval`), with several trainings at least as wide as a
-        paired bootstrap over episodes and trainings.
+    interval: of the difference (`paired_interval`), with several trainings at least as wide as
+        that of `estimate`.
     wins, losses: episodes that the first, or the second, solved in a larger share of its runs; the
         rest are ties.
     p: two-sided (`paired_test`; of single runs with equally many episodes a task McNemar's exact
-        one), with several trainings at least that of the bootstrap.
+        one), with several trainings at least that of `estimate`.
     corrected: by Holm, over all comparisons made together.
     significant: `corrected` is below 1 − confidence.
     smallest_p: the smallest that p can be with so many episodes.
@@ -150,8 +148,13 @@ def why_unpaired(first: Method, second: Method) -> str:
     return f"{what} have no episode in common: there is nothing to pair."
 
 
-def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
-    """Compare two methods."""
+def compare(
+    first: Method, second: Method, protocol: Protocol, over_trainings: bool = True
+) -> Comparison:
+    """Compare two methods.
+
+    over_trainings: whether interval and p are for other trainings too, where a side has several.
+    """
     require(first is not second, f"{first.label} cannot be compared with itself; name two methods.")
     pairing = pair_methods(first, second)
     require(pairing.keys, why_unpaired(first, second))
@@ -170,13 +173,12 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     gaps_of_tasks = by_task(gaps)
     interval = paired_interval(gaps_of_tasks, protocol.confidence)
     p = paired_test(gaps_of_tasks)
-    if len(first_rates.columns) > 1 or len(second_rates.columns) > 1:
-        first_values = by_task(first_rates)
-        second_values = by_task(-second_rates)
-        sides = {task: [first_values[task], second_values[task]] for task in first_values}
-        sampled = resampled_means(sides, protocol.samples, protocol.seed).sum(0)
-        interval = interval.widen(percentiles(sampled, protocol.confidence))
-        p = max(p, sampled_test(sampled))
+    several = len(first_rates.columns) > 1 or len(second_rates.columns) > 1
+    if over_trainings and several:
+        sides = [list(by_task(rates).values()) for rates in (first_rates, -second_rates)]
+        trained = estimate(sides)
+        interval = interval.widen(trained.interval(protocol.confidence).clip(-1, 1))
+        p = max(p, trained.p)
     wins, losses = wins_losses(gaps_of_tasks)
     smallest_p = paired_test({task: np.ones(len(values)) for task, values in gaps_of_tasks.items()})
     what = f"{first.label} − {second.label}"

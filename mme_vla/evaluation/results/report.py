@@ -227,9 +227,9 @@ def _method_text(results: Results) -> list[str]:
         (
             f"Intervals ({100 * protocol.confidence:g} %) are Wilson's, for the number of"
             " independent episodes that all runs and tasks are worth. With several trainings they"
-            " are at least as wide as a bootstrap over episodes within tasks and over trainings"
-            f" ({protocol.samples:,} samples, seed {protocol.seed}). They describe other episodes"
-            " of the same tasks, the deviation other seeds."
+            " are at least as wide as Student's t for other trainings (degrees of freedom by Welch"
+            " and Satterthwaite). They describe other episodes of the same tasks, the deviation"
+            " other seeds."
         ),
         (
             "Comparisons pair the episodes of the same scenes: an exact sign test on the episodes"

@@ -83,15 +83,13 @@ class Protocol:
         (`groupings_of`).
     errors: whether an episode that ended in an error is a `failure`, as in the official evaluation,
         or `missing`.
-    confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
+    confidence: of the intervals.
     """
 
     tasks: tuple[str, ...] = PAPER_ORDER
     episodes: int = TEST_EPISODES
     errors: str = "failure"
     confidence: float = 0.95
-    samples: int = 10_000
-    seed: int = 0
     task_suites: Mapping[str, str] = field(default_factory=dict)
     numbers: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     groupings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -132,11 +130,6 @@ class Protocol:
             (
                 0 < self.confidence < 1,
                 f"confidence={self.confidence} must lie between 0 and 1, for instance 0.95.",
-            ),
-            (
-                self.samples >= 1 and self.seed >= 0,
-                f"samples={self.samples} of the bootstrap must be at least 1, and"
-                f" seed={self.seed} at least 0.",
             ),
         ):
             require(holds, message)

@@ -10,16 +10,17 @@ All of them hold for three episodes as well as for 800. Rates are shares (0 to 1
   unequal numbers (Kish 1965).
 - A paired test: the exact sign test and the score test of that difference, the larger p of both.
   Several of them: Holm (1979).
-- Several trainings: a percentile bootstrap (Efron and Tibshirani 1993) over episodes and trainings.
+- Several trainings: Student's t with the degrees of freedom of Welch (1938) and Satterthwaite
+  (1946), for the variance between episodes and the one between trainings.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest, norm, t
 
 
 class Interval(NamedTuple):
@@ -36,6 +37,10 @@ class Interval(NamedTuple):
     def widen(self, other: "Interval") -> "Interval":
         """The smallest interval that has both in it."""
         return Interval(min(self.low, other.low), max(self.high, other.high))
+
+    def clip(self, low: float, high: float) -> "Interval":
+        """The part that a figure between `low` and `high` can have."""
+        return Interval(max(self.low, low), min(self.high, high))
 
 
 def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
@@ -176,6 +181,62 @@ def tango(gained: float, lost: float, pairs: float, confidence: float = 0.95) ->
     return Interval(float(low), float(high))
 
 
+# Trainings ----------------------------------------------------------------------------------------
+
+
+class Estimate(NamedTuple):
+    """A figure that several trainings give, for other episodes of its tasks and other trainings.
+
+    error: its standard error.
+    freedom: degrees of freedom of that, effective ones.
+    """
+
+    value: float
+    error: float
+    freedom: float
+
+    def interval(self, confidence: float = 0.95) -> Interval:
+        half = self.error * float(t.ppf(0.5 + confidence / 2, self.freedom))
+        return Interval(self.value - half, self.value + half)
+
+    @property
+    def p(self) -> float:
+        """Two-sided p of a value of 0: below 1 − confidence where `interval` has no 0 in it."""
+        if not self.error:
+            return float(self.value == 0)
+        return float(2 * t.sf(abs(self.value) / self.error, self.freedom))
+
+
+def estimate(methods: Sequence[Sequence[np.ndarray]]) -> Estimate:
+    """The sum of methods' means over tasks.
+
+    The variance of a mean of n trainings is that of their means, over n: two trainings that happen
+    to be alike count as little evidence, since their variance has one degree of freedom. The
+    variance of episodes is that within each task. What cannot be seen (of one training, of one
+    episode a task) is left out.
+
+    methods: of each and each task, [episodes, trainings], already averaged over the runs of a
+        training; the same episodes for all methods.
+    """
+    n_tasks = len(methods[0])
+    value = 0.0
+    parts = []  # variance and degrees of freedom
+    for tasks in methods:
+        of_trainings = np.mean([values.mean(0) for values in tasks], 0)
+        value += float(of_trainings.mean())
+        if len(of_trainings) > 1:
+            parts.append((of_trainings.var(ddof=1) / len(of_trainings), len(of_trainings) - 1))
+    for of_methods in zip(*methods, strict=True):
+        episodes = np.sum([values.mean(1) for values in of_methods], 0)
+        if len(episodes) > 1:
+            parts.append((episodes.var(ddof=1) / len(episodes) / n_tasks**2, len(episodes) - 1))
+    variance = float(sum(part for part, _ in parts))
+    if not variance:
+        return Estimate(value, 0.0, 1.0)
+    freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
+    return Estimate(value, math.sqrt(variance), float(freedom))
+
+
 # Tests --------------------------------------------------------------------------------------------
 
 
@@ -202,15 +263,6 @@ def paired_test(gaps: Mapping[str, np.ndarray]) -> float:
     return max(sign_test(wins, losses), float(2 * norm.sf(score)))
 
 
-def sampled_test(values: np.ndarray) -> float:
-    """Two-sided p of a difference from resampled values of it: below 1 − confidence where
-    `percentiles` has no 0 in it.
-    """
-    below = float((values <= 0).mean())
-    above = float((values >= 0).mean())
-    return min(1.0, 2 * min(below, above))
-
-
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's correction for several comparisons, in the order given."""
     values = np.asarray(p_values, np.float64)
@@ -223,20 +275,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 # Bootstrap ----------------------------------------------------------------------------------------
-
-
-def bootstrap(
-    tasks: Mapping[str, Sequence[np.ndarray]],
-    confidence: float = 0.95,
-    samples: int = 10_000,
-    seed: int = 0,
-) -> Interval:
-    """Percentile interval of a mean over tasks, resampling episodes within each task, and trainings
-    for all.
-
-    tasks: see `resampled_means`. The figure of several methods is the sum of theirs.
-    """
-    return percentiles(resampled_means(tasks, samples, seed).sum(0), confidence)
 
 
 def percentiles(values: np.ndarray, confidence: float = 0.95) -> Interval:
@@ -262,28 +300,16 @@ def sampled_interval(values: np.ndarray, exact: Interval) -> Interval:
 def resampled_means(
     tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int
 ) -> np.ndarray:
-    """Means over tasks of each method [methods, samples], of episodes sampled within each task, and
-    of trainings.
+    """Means over tasks of each method [methods, samples], of episodes sampled within each task
+    (Efron and Tibshirani 1993).
 
-    tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs
-        of a training: an episode is sampled with all of them, for all methods alike. Of one
-        training none is sampled.
+    tasks: for each task one array of [episodes] a method. An episode is sampled for all methods
+        alike.
     """
     rng = np.random.default_rng(seed)
-    n_trainings = [values.shape[1] for values in next(iter(tasks.values()))]
-    # Trainings have a generator of their own: episodes are the same with one training and several.
-    training_rng = np.random.default_rng([seed, 1])
-    shares = []  # how often each training is sampled: [samples, trainings] a method
-    for n in n_trainings:
-        if n == 1:
-            shares.append(np.ones((samples, 1)))
-        else:
-            shares.append(training_rng.multinomial(n, np.full(n, 1 / n), samples) / n)
-    means = np.zeros((len(n_trainings), samples))
+    means: Any = 0
     for values_of_methods in tasks.values():
         n_episodes = len(values_of_methods[0])
         sampled = rng.integers(0, n_episodes, (samples, n_episodes))
-        for method, (values, share) in enumerate(zip(values_of_methods, shares, strict=True)):
-            by_training = [values[:, i][sampled].mean(1) * share[:, i] for i in range(len(share.T))]
-            means[method] += sum(by_training)
+        means = means + np.stack([values[sampled].mean(1) for values in values_of_methods])
     return means / len(tasks)

@@ -178,12 +178,11 @@ class Board:
             len(amounts) == 1,
             f"Tasks have {sorted(amounts)} scenes: a board has as many of each task.",
         )
-        self.protocol = Protocol(tuple(tasks), amounts.pop(), samples=samples)
+        self.protocol = Protocol(tuple(tasks), amounts.pop())
+        self.samples = samples
         self.split = first.records[0].split
         self.action_space = first.action_space
-        # where intervals are of `draws`, and no others are read
-        self._once = replace(self.protocol, samples=1)
-        made = [_row(name, trainings, self._once) for name, trainings in rows.items()]
+        made = [_row(name, trainings, self.protocol) for name, trainings in rows.items()]
         self.rows = sorted(made, key=lambda row: -self.success(row))
 
     def of_kind(self, kind: str) -> list[Row]:
@@ -216,9 +215,9 @@ class Board:
         """
         values: dict[str, list[np.ndarray]] = {}
         for task in tasks:
-            values[task] = [row.outcomes(task).mean(1, keepdims=True) for row in rows]
-        means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
-        rng = np.random.default_rng([self.protocol.seed, 2])
+            values[task] = [row.outcomes(task).mean(1) for row in rows]
+        means = 100 * resampled_means(values, self.samples, seed=0)
+        rng = np.random.default_rng([0, 2])
         shared = self._training_deviation(self.rows, tasks)
         for row, sampled in zip(rows, means, strict=True):
             if row.facts.trained:
@@ -316,7 +315,7 @@ class Board:
     def _compared(self, pairs: Sequence[tuple[Row, Row]]) -> list[Comparison]:
         methods = [(first.method, second.method) for first, second in pairs]
         comparisons = []
-        for comparison in compare_all(methods, self._once, _compare):
+        for comparison in compare_all(methods, self.protocol, _compare):
             difference = self.sampled[comparison.first] - self.sampled[comparison.second]
             interval = sampled_interval(difference, comparison.interval)
             comparisons.append(replace(comparison, interval=interval))
@@ -473,7 +472,7 @@ class Board:
         intervals: list[Interval] = []
         for suite in self.protocol.suites:
             tasks = tuple(self.protocol.choose("suite", suite))
-            protocol = replace(self._once, tasks=tasks)
+            protocol = replace(self.protocol, tasks=tasks)
             comparisons.append(_compare(best.method, matched.method, protocol))
             of_best, of_matched = self.draws([best, matched], tasks)
             intervals.append(percentiles(of_best - of_matched))
@@ -532,10 +531,10 @@ def smallest_p(sizes: Sequence[int]) -> float:
 
 
 def _compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
-    """Scene by scene where all scenes are the same, else by score."""
+    """Of the trained policies: scene by scene where all scenes are the same, else by score."""
     if pair_methods(first, second).left_out:
         return compare_unpaired(first, second, protocol)
-    return compare(first, second, protocol)
+    return compare(first, second, protocol, over_trainings=False)
 
 
 def homogeneity(

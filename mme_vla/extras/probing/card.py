@@ -301,7 +301,7 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
         tables = [_by_task(differences) for differences in table.values()]
         tasks = {}
         for task in tables[0]:
-            tasks[task] = [of_arm[task][:, None] for of_arm in tables]
+            tasks[task] = [of_arm[task] for of_arm in tables]
         sampled = dict(zip(table, resampled_means(tasks, _SAMPLES, seed=0), strict=True))
     losses = {}
     for label, differences in table.items():
