@@ -601,7 +601,6 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     ("arguments", "message"),
     [([], "Name files or folders"), (["nowhere"], "does not exist"),
      (["--demo", "--compare", "pi05", "pi06"], "pi06"),
-     (["--demo", "--seed", "-1"], "seed=-1 at least 0"),
      (["--demo", "--tasks", "Binfill"], "Did you mean 'BinFill'")],
 )  # fmt: skip
 def test_mistakes_end_with_a_sentence(
