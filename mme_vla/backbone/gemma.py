@@ -468,11 +468,15 @@ class JointTransformer(nn.Module):
             layers.append(StaticKV(keys, torch.empty_like(keys), 0))
         return KVCache(layers, [], blocks[0].mask[:, :0])
 
-    def time_modulations(self, condition: Tensor) -> TimeModulations:
+    def time_modulations(self, condition: Tensor, dtype: torch.dtype) -> TimeModulations:
         """Compute every layer's modulation for conditions [m, c] at once: the weights are read
-        once, not m times.
+        once, not m times. Gates are in `dtype`, that of the tokens.
         """
-        *of_layers, final = (norm.modulation(condition) for norm in self.time_norms())
+        modulations = []
+        for norm in self.time_norms():
+            modulation = norm.modulation(condition)
+            modulations.append(modulation._replace(gate=modulation.gate.to(dtype)))
+        *of_layers, final = modulations
         layers = map(LayerTimeModulation, of_layers[::2], of_layers[1::2])
         return TimeModulations(list(layers), final)
 

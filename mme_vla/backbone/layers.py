@@ -50,9 +50,24 @@ def float32_linear(layer: nn.Linear, x: Tensor) -> Tensor:
 BASE = 10_000.0
 
 
+def add_rounded(a: Tensor, b: Tensor, dtype: torch.dtype, factor: Tensor | None = None) -> Tensor:
+    """A + b, or a + b·factor, in float32, rounded to `dtype`; b has the shape of the sum.
+
+    While eager layers sample, rounding is no kernel of its own.
+    """
+    is_traced = torch.is_grad_enabled() or torch.compiler.is_compiling()
+    if is_traced or dtype == torch.float32:
+        total = a + b if factor is None else torch.addcmul(a, b, factor)
+        return total.to(dtype)
+    rounded = torch.empty_like(b, dtype=dtype)
+    if factor is None:
+        return torch.add(a, b, out=rounded)
+    return torch.addcmul(a, b, factor, out=rounded)
+
+
 class Rotation(NamedTuple):
-    """cos and sin of every position's angles, float32 [b, n, 1, e]: both halves turn by the same
-    angles.
+    """cos and ±sin of every position's angles, float32 [b, n, 1, e]: both halves turn by the same
+    angles, and the sine of the first half is negative.
     """
 
     cos: Tensor
@@ -75,15 +90,17 @@ def rotation(positions: Tensor, head_dim: int) -> Rotation:
     else:
         coordinates = positions[..., None]
     angles = (coordinates[:, :, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
-    return Rotation(angles.cos(), angles.sin())
+    sin = angles.sin()
+    sin[..., : head_dim // 2].neg_()
+    return Rotation(angles.cos(), sin)
 
 
 def rotate(x: Tensor, rope: Rotation) -> Tensor:
     """Rotate queries or keys [b, n, heads, e]; the result keeps the dtype of x."""
-    exact = x.float()
+    exact = x.float() if torch.is_grad_enabled() else x
     a, b = exact.chunk(2, dim=-1)
-    quarter_turned = torch.cat([-b, a], dim=-1)
-    return torch.addcmul(exact * rope.cos, quarter_turned, rope.sin).to(x.dtype)
+    swapped = torch.cat([b, a], dim=-1)
+    return add_rounded(exact * rope.cos, swapped, x.dtype, rope.sin)
 
 
 EPS = 1e-6
@@ -139,13 +156,13 @@ class AdaRMSNorm(nn.Module):
         return Modulation(1 + scale, shift, gate)
 
     def forward(self, x: Tensor, condition: Tensor | Modulation) -> tuple[Tensor, Tensor]:
-        """Normalise [b, n, d]; the second value is the gate, in the condition's float32:
-        compiled layers pass it on to the next one as it is, without a kernel that casts it.
+        """Normalise [b, n, d]; the second value is the gate, in its own dtype: compiled layers pass
+        it on to the next one as it is, without a kernel that casts it.
 
         `condition` is the raw [b, c] or, when sampling, a modulation made beforehand.
         """
         m = condition if isinstance(condition, Modulation) else self.modulation(condition)
-        return torch.addcmul(m.shift, rms_normalise(x), m.factor).to(x.dtype), m.gate
+        return add_rounded(m.shift, rms_normalise(x), x.dtype, m.factor), m.gate
 
 
 @dataclass

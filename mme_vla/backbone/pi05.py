@@ -93,7 +93,7 @@ class Pi05Backbone(
         self.transformer = JointTransformer(config, experts)
         self._float32_linear: Callable[[nn.Linear, Tensor], Tensor] = float32_linear
         self.keep_times = False
-        self._cached: dict[int, TimeModulations] = {}
+        self._cached: dict[tuple[int, torch.dtype], TimeModulations] = {}
         self._cached_stamp: tuple[object, ...] = ()
         self.action_in = nn.Linear(config.action_dim, width)
         self.action_out = nn.Linear(width, config.action_dim)
@@ -227,13 +227,13 @@ class Pi05Backbone(
         step_layout = self.transformer.layout(step_blocks, injection.visibility, prefix)
         if injection.condition is None:
             rows = 1
-            modulations = self.time_modulations(len(times))
+            modulations = self.time_modulations(len(times), step_layout.dtype)
         else:  # memory changes the condition of each sample: every time for each
             rows = len(x)
             changed = []
             for time in self.time_condition(times):
                 changed.append(injection.condition(time.expand(rows, -1)))
-            modulations = self.transformer.time_modulations(torch.cat(changed))
+            modulations = self.transformer.time_modulations(torch.cat(changed), step_layout.dtype)
 
         def predict_at(x_t: Tensor, index: int) -> Tensor:
             # Its keys and values go behind the prefix, where the next step overwrites them.
@@ -255,20 +255,21 @@ class Pi05Backbone(
             x = self.head.step(x, velocity(x, index), len(times), scaled)
         return x
 
-    def time_modulations(self, steps: int) -> TimeModulations:
+    def time_modulations(self, steps: int, dtype: torch.dtype) -> TimeModulations:
         """Every layer's time modulations at the times of so many steps; kept for the next chunk
         while `keep_times`.
         """
         stamp = self.sampling_stamp() if self.keep_times else ()
-        if self.keep_times and stamp == self._cached_stamp and steps in self._cached:
-            return self._cached[steps]
+        key = steps, dtype
+        if self.keep_times and stamp == self._cached_stamp and key in self._cached:
+            return self._cached[key]
         times = self.head.times(steps, next(self.parameters()).device)
-        modulations = self.transformer.time_modulations(self.time_condition(times))
+        modulations = self.transformer.time_modulations(self.time_condition(times), dtype)
         if self.keep_times:
             if stamp != self._cached_stamp:
                 self._cached = {}
                 self._cached_stamp = stamp
-            self._cached[steps] = modulations
+            self._cached[key] = modulations
         return modulations
 
     # Optional capabilities

@@ -14,6 +14,7 @@ from mme_vla.backbone.layers import (
     EPS,
     RMSNorm,
     Rotation,
+    add_rounded,
     additive_mask,
     attend,
     compute_dtype,
@@ -69,8 +70,8 @@ class ModulatorLayer(nn.Module):
             # The same direction at x's own size: the norm that follows removes it, and α = β = 0
             # gives x to the bit.
             size = (x.float().square().mean(-1, keepdim=True) + EPS).sqrt()
-            return (x.float() * (1 + alpha) + size * beta).to(x.dtype)
-        return (rms_normalise(x) * (1 + alpha) + beta).to(x.dtype)
+            return add_rounded(x.float() * (1 + alpha), size * beta, x.dtype)
+        return add_rounded(rms_normalise(x) * (1 + alpha), beta, x.dtype)
 
 
 @INTEGRATIONS.register("modulator")

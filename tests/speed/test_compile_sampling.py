@@ -48,7 +48,7 @@ def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> T
         [backbone.action_block(noise)], injection.visibility, prefix
     )
     times = backbone.time_condition(flow.euler_times(steps, noise.device))
-    conditions = backbone.transformer.time_modulations(times)
+    conditions = backbone.transformer.time_modulations(times, before.dtype)
     x = noise
     for index in range(steps):
         action = [backbone.action_block(x)]
