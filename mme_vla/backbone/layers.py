@@ -2,7 +2,7 @@
 visibility table.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
 
@@ -50,19 +50,17 @@ def float32_linear(layer: nn.Linear, x: Tensor) -> Tensor:
 BASE = 10_000.0
 
 
-def add_rounded(a: Tensor, b: Tensor, dtype: torch.dtype, factor: Tensor | None = None) -> Tensor:
-    """A + b, or a + b·factor, in float32, rounded to `dtype`; b has the shape of the sum.
+def rounded(operation: Callable[..., Tensor], *operands: Tensor, dtype: torch.dtype) -> Tensor:
+    """`operation` of float32 operands, rounded to `dtype`. While eager layers sample, rounding is
+    no kernel of its own.
 
-    While eager layers sample, rounding is no kernel of its own.
+    operation: of PyTorch, with an argument `out`.
     """
     is_traced = torch.is_grad_enabled() or torch.compiler.is_compiling()
     if is_traced or dtype == torch.float32:
-        total = a + b if factor is None else torch.addcmul(a, b, factor)
-        return total.to(dtype)
-    rounded = torch.empty_like(b, dtype=dtype)
-    if factor is None:
-        return torch.add(a, b, out=rounded)
-    return torch.addcmul(a, b, factor, out=rounded)
+        return operation(*operands).to(dtype)
+    shape = torch.broadcast_shapes(*(operand.shape for operand in operands))
+    return operation(*operands, out=operands[0].new_empty(shape, dtype=dtype))
 
 
 class Rotation(NamedTuple):
@@ -100,7 +98,7 @@ def rotate(x: Tensor, rope: Rotation) -> Tensor:
     exact = x.float() if torch.is_grad_enabled() else x
     a, b = exact.chunk(2, dim=-1)
     swapped = torch.cat([b, a], dim=-1)
-    return add_rounded(exact * rope.cos, swapped, x.dtype, rope.sin)
+    return rounded(torch.addcmul, exact * rope.cos, swapped, rope.sin, dtype=x.dtype)
 
 
 EPS = 1e-6
@@ -122,7 +120,12 @@ class RMSNorm(nn.Module):
         """Normalise [b, n, d]; the second value is the missing gate, so that both
         norms read alike.
         """
-        return rms_normalise(x, 1 + self.scale.float()).to(x.dtype), None
+        return rms_normalise(x, self.factor).to(x.dtype), None
+
+    @property
+    def factor(self) -> Tensor:
+        """1 + scale [d], float32."""
+        return 1 + self.scale.float()
 
 
 class Modulation(NamedTuple):
@@ -162,7 +165,8 @@ class AdaRMSNorm(nn.Module):
         `condition` is the raw [b, c] or, when sampling, a modulation made beforehand.
         """
         m = condition if isinstance(condition, Modulation) else self.modulation(condition)
-        return add_rounded(m.shift, rms_normalise(x), x.dtype, m.factor), m.gate
+        normed = rms_normalise(x)
+        return rounded(torch.addcmul, m.shift, normed, m.factor, dtype=x.dtype), m.gate
 
 
 @dataclass

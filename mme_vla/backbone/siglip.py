@@ -72,7 +72,10 @@ class VisionTower(nn.Module):
             x = patches.flatten(2).transpose(1, 2) + vit.pos_embed.float()
         dtype = compute_dtype(vit.head.weight)
         x = x.to(dtype)
-        with fused_kernels(x):
+        # Where the weights have the compute dtype, autocast would only cast those of the norms.
+        casts = any(weight.dtype != dtype for weight in vit.parameters())
+        casts = casts and torch.is_autocast_enabled(kind)
+        with fused_kernels(x), torch.autocast(kind, dtype, enabled=casts):
             if frame_mask is None:
                 for block in vit.blocks:
                     x = block(x)
@@ -80,7 +83,7 @@ class VisionTower(nn.Module):
                 from mme_vla.backbone.clips import through_time
 
                 x = through_time(vit.blocks, x.unflatten(0, clips), frame_mask, every)
-        return vit.head(vit.norm(x)).to(dtype)
+            return vit.head(vit.norm(x)).to(dtype)
 
 
 def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:

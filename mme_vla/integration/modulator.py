@@ -14,13 +14,13 @@ from mme_vla.backbone.layers import (
     EPS,
     RMSNorm,
     Rotation,
-    add_rounded,
     additive_mask,
     attend,
     compute_dtype,
     rms_normalise,
     rotate,
     rotation,
+    rounded,
 )
 from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
@@ -53,25 +53,30 @@ class ModulatorLayer(nn.Module):
         k, v = kv.chunk(2, dim=-2)
         return rotate(k, rope), v
 
-    def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor, rope: Rotation) -> Tensor:
-        """r: what actions [b, h, d] read from memory, their queries rotated by the first h of
-        `rope`.
+    def read_memory(
+        self, normed: Tensor, k: Tensor, v: Tensor, mask: Tensor, rope: Rotation
+    ) -> Tensor:
+        """r: what actions, normed [b, h, d], read from memory, their queries rotated by the first h
+        of `rope`.
         """
-        q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
-        q = rotate(q, rope.rows(slice(x.shape[1])))
+        q = self.q(normed).unflatten(-1, (-1, self.head_dim))
+        q = rotate(q, rope.rows(slice(normed.shape[1])))
         return self.out(attend(q, k, v, mask))
 
-    def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor, rope: Rotation) -> Tensor:
-        """x̂ = x/rms(x)·(1 + α) + β with (α, β) = W r + b."""
-        alpha, beta = (
-            self.modulation(self.read_memory(x, k, v, mask, rope)).float().chunk(2, dim=-1)
-        )
+    def forward(
+        self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor, rope: Rotation, factor: Tensor
+    ) -> Tensor:
+        """x̂ = x/rms(x)·(1 + α) + β with (α, β) = W r + b. `factor` is the norm's."""
+        direction = rms_normalise(x)
+        normed = rounded(torch.mul, direction, factor, dtype=x.dtype)
+        r = self.read_memory(normed, k, v, mask, rope)
+        alpha, beta = self.modulation(r).float().chunk(2, dim=-1)
         if self.exact_identity:
             # The same direction at x's own size: the norm that follows removes it, and α = β = 0
             # gives x to the bit.
             size = (x.float().square().mean(-1, keepdim=True) + EPS).sqrt()
-            return add_rounded(x.float() * (1 + alpha), size * beta, x.dtype)
-        return add_rounded(rms_normalise(x) * (1 + alpha), beta, x.dtype)
+            return rounded(torch.add, x.float() * (1 + alpha), size * beta, dtype=x.dtype)
+        return rounded(torch.add, direction * (1 + alpha), beta, dtype=x.dtype)
 
 
 @INTEGRATIONS.register("modulator")
@@ -132,5 +137,6 @@ class Modulator(Integration):
         hooks = []
         for layer in self.layers:
             k, v = self._keys_values(layer, tokens, rope)
-            hooks.append(partial(layer, k=k, v=v, mask=mask, rope=query_rope))
+            factor: Tensor = layer.norm.factor  # type: ignore[union-attr]
+            hooks.append(partial(layer, k=k, v=v, mask=mask, rope=query_rope, factor=factor))
         return LayerHooks(hooks)
