@@ -190,7 +190,16 @@ class MMEModel(nn.Module):
             step_losses = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
         check_rows(f"{type(self.backbone).__name__}.loss", step_losses, len(batch.prompt))
         action = masked_mean(step_losses, batch.action_mask, batch.weight)
+        return self._add_auxiliary(action, memory, batch, metrics)
 
+    def _add_auxiliary(
+        self,
+        action: Tensor,
+        memory: MemoryTokens | None,
+        batch: Batch,
+        metrics: dict[str, Tensor] | None,
+    ) -> Tensor:
+        """The loss of the actions with the memory's own in training, and what is worth logging."""
         total = action
         auxiliary: dict[str, Tensor] = {}
         if self.training:
@@ -199,7 +208,6 @@ class MMEModel(nn.Module):
             weight = self.loss_weights.get(name, 1.0)
             if weight:  # 0 leaves one out
                 total = total + weight * value
-
         if metrics is not None:
             metrics["loss"] = total.detach()
             if auxiliary:

@@ -2,8 +2,9 @@
 
 One legend for shapes, used in the whole library:
 
-b batch · n tokens · d width · t frames · v views (cameras) · h action horizon · a action width · l
-prompt length · N query heads · K key and value heads · e width of a head
+b batch · n tokens, or episodes of a call · d width · t frames · v views (cameras) · h action
+horizon · a action width · w width of an executed action · l prompt length · N query heads · K key
+and value heads · e width of a head
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -44,7 +44,8 @@ EPISODE_BESIDE = [
 """Functions that the rows of (g) name and do not list."""
 EXTENSIONS = [
     ("registry.py", "installed_extensions"), ("config/trees.py", "library_trees"),
-    ("policy/saving.py", "policy_class"), ("cli/table.py", "commands"),
+    ("config/composition.py", "manipulate_search_path"), ("policy/saving.py", "policy_class"),
+    ("cli/table.py", "commands"), ("cli/__init__.py", "run"),
 ]  # fmt: skip
 ALONE = "README.md"
 QUESTIONS = (

@@ -1,6 +1,6 @@
 """Gemma experts under joint attention: every expert has its own weights, all share one attention.
 
-b batch · n tokens · d an expert's width · N query heads · K key heads · h head width
+b batch · n tokens · d an expert's width · N query heads · K key heads · e head width
 """
 
 from collections.abc import Callable, Sequence
@@ -57,10 +57,12 @@ class StaticKV(NamedTuple):
 
 
 class LayerTimeModulation(NamedTuple):
-    """One layer's two time modulations, made beforehand for a sampling step."""
+    """What one layer's two norms are conditioned on: time modulations, made beforehand for a
+    sampling step, or in training the embedded time.
+    """
 
-    attention: Modulation
-    mlp: Modulation
+    attention: Modulation | Tensor | None
+    mlp: Modulation | Tensor | None
 
 
 class Segment(NamedTuple):
@@ -244,12 +246,8 @@ class JointBlock(nn.Module):
         # While compiled layers sample, the sum that ends a layer is deferred: the next one adds it
         # in one kernel with its first norm. All segments of the pass then come with an update.
         defers_sum = segments[0].update is not None
-        attention_condition: Tensor | Modulation | None
-        mlp_condition: Tensor | Modulation | None
-        if isinstance(condition, LayerTimeModulation):
-            attention_condition, mlp_condition = condition.attention, condition.mlp
-        else:
-            attention_condition = mlp_condition = condition
+        if not isinstance(condition, LayerTimeModulation):
+            condition = LayerTimeModulation(condition, condition)
 
         # Every expert projects its own tokens. Only the action expert's norms have a condition.
         querying: list[Querying] = []
@@ -260,7 +258,7 @@ class JointBlock(nn.Module):
             rows = slice(row, row + segment.tokens.shape[1])
             row = rows.stop
             x = segment.summed()
-            of_norm = attention_condition if segment.expert == self.action_expert else None
+            of_norm = condition.attention if segment.expert == self.action_expert else None
             q, k, v, gate = layer.project(x, rope.rows(rows), of_norm)
             keys.append(k)
             values.append(v)
@@ -284,7 +282,7 @@ class JointBlock(nn.Module):
         updated = []
         for each, piece in zip(querying, attended.split(lengths, dim=1), strict=True):
             if each.expert == self.action_expert:
-                finished = each.layer.feed_forward(each.x, piece, each.gate, mlp_condition, hook)
+                finished = each.layer.feed_forward(each.x, piece, each.gate, condition.mlp, hook)
             else:
                 finished = each.layer.feed_forward(each.x, piece, each.gate, None, None)
             following = Segment(each.expert, *finished)
@@ -339,7 +337,7 @@ class TimeModulations:
         """
         at_time = slice(index * rows, (index + 1) * rows)
 
-        def pick(m: Modulation) -> Modulation:
+        def pick(m: Any) -> Modulation:
             return Modulation(m.factor[at_time], m.shift[at_time], m.gate[at_time])
 
         layers = [LayerTimeModulation(pick(m.attention), pick(m.mlp)) for m in self.layers]

@@ -228,12 +228,10 @@ class Pi05Backbone(
         if injection.condition is None:
             rows = 1
             modulations = self.time_modulations(len(times), step_layout.dtype)
-        else:  # memory changes the condition of each sample: every time for each
+        else:  # as memory changes it for each sample
             rows = len(x)
-            changed = []
-            for time in self.time_condition(times):
-                changed.append(injection.condition(time.expand(rows, -1)))
-            modulations = self.transformer.time_modulations(torch.cat(changed), step_layout.dtype)
+            conditions = self.changed_conditions(injection.condition, times, rows)
+            modulations = self.transformer.time_modulations(conditions, step_layout.dtype)
 
         def predict_at(x_t: Tensor, index: int) -> Tensor:
             # Its keys and values go behind the prefix, where the next step overwrites them.
@@ -254,6 +252,15 @@ class Pi05Backbone(
             scaled = None if increments is None else self.head.deviation * increments[:, index]
             x = self.head.step(x, velocity(x, index), len(times), scaled)
         return x
+
+    def changed_conditions(
+        self, change: Callable[[Tensor], Tensor], times: Tensor, rows: int
+    ) -> Tensor:
+        """The condition of every time, changed for each sample [times·rows, c]."""
+        changed = []
+        for condition in self.time_condition(times):
+            changed.append(change(condition.expand(rows, -1)))
+        return torch.cat(changed)
 
     def time_modulations(self, steps: int, dtype: torch.dtype) -> TimeModulations:
         """Every layer's time modulations at the times of so many steps; kept for the next chunk

@@ -134,9 +134,11 @@ class Modulator(Integration):
         query_rope = rotation(slots[:, n:], self.head_dim)
         # Every action sees the same keys: b 1 1 m.
         mask = additive_mask(memory.mask[:, None], tokens.dtype)
+        # Of all layers at once: these few numbers need three kernels, not two for each layer.
+        scales = torch.stack([layer.norm.scale for layer in self.layers])  # type: ignore[union-attr, misc]
+        factors = (1 + scales.float()).unbind()
         hooks = []
-        for layer in self.layers:
+        for layer, factor in zip(self.layers, factors, strict=True):
             k, v = self._keys_values(layer, tokens, rope)
-            factor: Tensor = layer.norm.factor  # type: ignore[union-attr]
             hooks.append(partial(layer, k=k, v=v, mask=mask, rope=query_rope, factor=factor))
         return LayerHooks(hooks)

@@ -100,7 +100,7 @@ class MemoryModule(nn.Module):
         """Choose the stored tokens for step `step`.
 
         Cheap, on the CPU, and the same code offline and online. It must not depend on anything
-        later than `step`.
+        later than `step` (as TokenDrop does with `causal=False`, the released offline rule).
 
         Args:
             history: the episode so far (offline: possibly longer than `step`).

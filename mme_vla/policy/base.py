@@ -219,8 +219,9 @@ class Policy(nn.Module):
         return Episode(self, goal, seed)
 
     def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
-        """Choose the next chunk for one episode or for many in one batch, adding nothing to their
-        memories. After checks it calls `choose_actions`, the last function of this file.
+        """Choose the next chunk for one episode or for many in one batch. No frame is observed; a
+        recurrent memory continues its stream. After checks it calls `choose_actions`, the last
+        function of this file.
 
         Returns:
             float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them,
@@ -420,7 +421,7 @@ def choose_actions(
     Args:
         steps: of an iterative sampler; its default by default.
         sample_chunk: in place of `Policy.predict_chunk`, from the observation and its noise to the
-            normalised chunk [n, h, a].
+            normalised chunk [n, h, a]: for what records how a chunk was sampled.
     """
     require(
         all(episode.policy is policy for episode in episodes),

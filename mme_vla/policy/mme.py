@@ -340,7 +340,8 @@ class MMEPolicy(NetworkPolicy, Recomputes):
             return self.model.sample(batch, values, steps, memory)
         if memory is None:
             memory = self.model.memory_tokens(batch)
-        return self._sampler(batch, values, steps or self.info.sample_steps, memory)
+        steps = self.info.sample_steps if steps is None else steps
+        return self._sampler(batch, values, steps, memory)
 
     def compile_sampling(
         self, layers: bool = False, report: Callable[[str], object] = lambda text: None

@@ -96,8 +96,8 @@ def run_on(driver: Path, program: str, *words: str) -> str:
         ("tokendrop_expert", "compiled", 1320, 990),
         ("ttt_expert", "compiled", 1320, 990),
         ("rmt_context", "compiled", 1320, 921),
-        ("pi05", "eager", 5220, 921),
-        ("framesamp_modul", "eager", 8860, 1479),
+        ("pi05", "eager", 3680, 921),
+        ("framesamp_modul", "eager", 5830, 1479),
     ],
 )
 def test_a_full_size_chunk_launches_few_kernels(

@@ -211,7 +211,8 @@ class VecEnv:
         """Wait until at least one worker is ready, and take the replies of all that are.
 
         A worker that died, hangs or raised anything but a `UserError` or `SceneError` is replaced.
-        Its reply has `crashed` and the status `error`; the others continue.
+        Its reply has the status `error` and, as `error`, a `WorkerCrash` or what was raised; the
+        others continue.
 
         Args:
             timeout: seconds that this call waits at most, whatever hangs; None waits as long as
