@@ -42,11 +42,11 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import Backbone, Injection
-from mme_vla.backbone.layers import Block, autocast
+from mme_vla.backbone.layers import autocast
 from mme_vla.errors import UserError, check_integer, check_known
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule, encode_selection
-from mme_vla.types import Batch, MemoryTokens, Noise, to_unit_range
+from mme_vla.types import Batch, MemoryTokens, Noise, check_mask, to_unit_range
 
 
 def unit_images(images: Tensor, augmentation: Tensor | None = None) -> Tensor:
@@ -114,10 +114,11 @@ class MMEModel(nn.Module):
             augmentation: random numbers [b, …] of the image augmentation.
 
         Raises:
-            ValueError: the images are not uint8.
+            ValueError: the images are not uint8, or `image_mask` does not say which of them count.
         """
         if batch.images.dtype != torch.uint8:
             raise ValueError(f"Batch.images must be uint8 0…255, got {batch.images.dtype}.")
+        check_mask("Batch.image_mask", batch.image_mask, batch.images.shape[:2])
         images = self.transform_images(batch.images, augmentation)
         past = batch.past
         if past is None:
@@ -149,15 +150,21 @@ class MMEModel(nn.Module):
         """The observation's blocks with memory added. The batch's images are prepared.
 
         Raises:
-            ValueError: there are more memory tokens than the memory's budget, or of them not one
-                row a sample.
+            ValueError: there are more memory tokens than the memory's budget, or they have not one
+                row a sample or another width than the integration takes.
         """
         if memory is not None:
-            check_tokens(memory, len(batch.prompt), self.memory)
+            check_tokens(memory, len(batch.prompt), self.memory, self.integration.memory_width)
         injection = self.integration.inject(self.backbone.embed(batch), memory)
-        if "positions" not in self.backbone.supports:
-            for block in injection.blocks:
-                check_uncounted(block, self.backbone)
+        for block in injection.blocks:
+            if block.positions is not None and "positions" not in self.backbone.supports:
+                kind = type(self.backbone).__name__
+                raise UserError(
+                    f"The block {block.name!r} has positions {list(block.positions.shape)}, and"
+                    f" {kind} counts tokens in causal order. Allowed here is Block.positions=None."
+                    " A backbone whose `supports` has 'positions', such as backbone=pi05, takes"
+                    " others."
+                )
         return injection
 
     # Loss and samples
@@ -181,14 +188,15 @@ class MMEModel(nn.Module):
             metrics: receives what is worth logging, detached: `loss`, and if there are auxiliary
                 losses `losses/<name>` of all, unweighted; `memory/<name>` of the memory's own.
         """
-        check_chunks(batch, noise)
         check_noise(noise, len(batch.prompt))
+        check_chunks(batch, noise)
         batch = self.prepare_images(batch, augmentation)
         if memory is None:
             memory = self.memory_tokens(batch)
         with self.autocast():
             step_losses = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
-        check_rows(f"{type(self.backbone).__name__}.loss", step_losses, len(batch.prompt))
+        shape = (len(batch.prompt), *step_losses.shape[1:])
+        check_shape(f"{type(self.backbone).__name__}.loss", step_losses, shape)
         action = masked_mean(step_losses, batch.action_mask, batch.weight)
         return self._add_auxiliary(action, memory, batch, metrics)
 
@@ -227,7 +235,12 @@ class MMEModel(nn.Module):
         losses: dict[str, Tensor] = {}
         if memory is not None:
             for name, values in memory.losses.items():
-                check_auxiliary(name, values, len(batch.prompt))
+                if name == "action" or values.shape != batch.prompt.shape[:1]:
+                    raise ValueError(
+                        f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one"
+                        f" number a sample, [{len(batch.prompt)}], under another name than"
+                        " 'action'."
+                    )
                 losses[name] = weighted_mean(values.float(), batch.weight)
         for name in self.loss_weights:
             check_known("auxiliary loss in train.losses:", name, list(losses))
@@ -293,43 +306,23 @@ class MMEModel(nn.Module):
         return autocast(self.device, self.compute_dtype)
 
 
-def check_uncounted(block: Block, backbone: Backbone) -> None:
-    """Make sure that a block for a backbone which numbers tokens itself brings no positions."""
-    if block.positions is None:
-        return
-    numbers = "1 number"
-    if block.positions.ndim > 2 and block.positions.shape[-1] > 1:
-        numbers = f"{block.positions.shape[-1]} numbers"
-    raise UserError(
-        f"The block {block.name!r} has positions of {numbers} a token,"
-        f" and {type(backbone).__name__} counts tokens in causal order. Allowed here is"
-        " Block.positions=None. A backbone whose `supports` has 'positions', such as"
-        " backbone=pi05, takes others."
-    )
-
-
-def check_rows(what: str, values: Tensor, samples: int) -> None:
-    """Raise an error unless a tensor has one row a sample: others would be broadcast silently."""
-    if values.ndim == 0 or len(values) != samples:
-        raise ValueError(
-            f"{what} has shape {list(values.shape)}: it needs one row for each of {samples}"
-            " samples."
-        )
-
-
 def check_shape(what: str, values: Tensor | None, shape: Sequence[int]) -> None:
-    """Raise an error unless a tensor, if there is one, has a shape."""
+    """Raise an error unless a tensor, if there is one, has a shape: one row for all samples would
+    be broadcast silently.
+    """
     if values is not None and values.shape != tuple(shape):
         raise ValueError(f"{what} has shape {list(values.shape)}: it must be {list(shape)}.")
 
 
-def check_tokens(tokens: MemoryTokens, samples: int, memory: MemoryModule | None) -> None:
-    """Raise an error unless memory tokens have one row a sample and are within the budget of the
-    memory, if there is one.
+def check_tokens(
+    tokens: MemoryTokens, samples: int, memory: MemoryModule | None, width: int
+) -> None:
+    """Raise an error unless memory tokens have one row a sample and the width that the integration
+    takes, and are within the budget of the memory, if there is one.
     """
-    check_rows("MemoryTokens.tokens", tokens.tokens, samples)
-    check_shape("MemoryTokens.mask", tokens.mask, tokens.tokens.shape[:2])
     n_tokens = tokens.tokens.shape[1]
+    what = "MemoryTokens.tokens, [samples, tokens, integration.memory_width],"
+    check_shape(what, tokens.tokens, (samples, n_tokens, width))
     if memory is not None and n_tokens > memory.budget:
         raise ValueError(
             f"{type(memory).__name__} returned {n_tokens} memory tokens; its budget is"
@@ -338,9 +331,14 @@ def check_tokens(tokens: MemoryTokens, samples: int, memory: MemoryModule | None
 
 
 def check_noise(noise: Mapping[str, Tensor], samples: int) -> None:
-    """Raise an error unless random numbers have one row a sample."""
+    """Raise an error unless random numbers have names and one row a sample."""
+    if not isinstance(noise, Mapping):
+        raise ValueError(
+            f"The noise is a {type(noise).__name__}: give tensors by name, as training_noise() and"
+            ' sampling_noise() do, such as {"noise": …}.'
+        )
     for name, values in noise.items():
-        check_rows(f"The noise {name!r}", values, samples)
+        check_shape(f"The noise {name!r}", values, (samples, *values.shape[1:]))
 
 
 def check_chunks(batch: Batch, noise: Mapping[str, Tensor]) -> None:
@@ -359,15 +357,6 @@ def check_chunks(batch: Batch, noise: Mapping[str, Tensor]) -> None:
         raise ValueError(
             f"Batch.actions {shapes} differ in shape: pad actions with zeros to the network's, and"
             " give training_noise() the number of samples."
-        )
-
-
-def check_auxiliary(name: str, values: Tensor, samples: int) -> None:
-    """Raise an error unless an auxiliary loss has one number a sample, and a name of its own."""
-    if name == "action" or values.shape != (samples,):
-        raise ValueError(
-            f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one number a"
-            f" sample, [{samples}], under another name than 'action'."
         )
 
 

@@ -37,14 +37,11 @@ cannot change them.
 """
 
 
-def named_noise(noise: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> Noise:
-    """Noise by name; a bare tensor is a flow's `noise`."""
-    if isinstance(noise, Tensor):
-        noise = {"noise": noise}
-    named = dict(noise or {})
-    for name, value in more.items():
-        if value is not None:
-            named[name] = value
+def named_noise(noise: Mapping[str, Tensor] | Tensor | None, time: Tensor | None = None) -> Noise:
+    """Noise by name; a bare tensor is a flow's `noise`, with its times beside it."""
+    named = {"noise": noise} if isinstance(noise, Tensor) else dict(noise or {})
+    if time is not None:
+        named["time"] = time
     return named
 
 
@@ -58,6 +55,15 @@ def stack_noise(rows: Sequence[Mapping[str, Tensor]], device: torch.device | Non
 def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -> Noise:
     """Every value through `change`: rows of a batch, another device."""
     return {name: change(value) for name, value in noise.items()}
+
+
+def check_mask(what: str, mask: Tensor, shape: Sequence[int]) -> None:
+    """Raise an error unless a mask is bool and of a shape: one of numbers would be added or counted
+    somewhere, and one row broadcast.
+    """
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != tuple(shape):
+        kind, size = getattr(mask, "dtype", mask), list(getattr(mask, "shape", ()))
+        raise ValueError(f"{what} is {kind} {size}: it must be torch.bool {list(shape)}.")
 
 
 class Labels(dict[str, Tensor]):
@@ -175,6 +181,14 @@ class HistoryTokens(TensorStruct):
     step: Tensor | None = None
     labels: Labels = field(default_factory=Labels)
 
+    def __post_init__(self) -> None:
+        check_mask("HistoryTokens.mask", self.mask, self.features.shape[:-1])
+        if not self.features.is_floating_point():
+            raise ValueError(
+                f"HistoryTokens.features is {self.features.dtype}: it must be of floats. A cache"
+                " holds bfloat16 as uint16: features.view(torch.bfloat16)."
+            )
+
     @property
     def ages(self) -> Tensor | None:
         """How many frames before the current one each token's frame lies, [b, n] float32; 0 on
@@ -182,7 +196,7 @@ class HistoryTokens(TensorStruct):
         """
         if self.step is None:
             return None
-        return (self.step[:, None] - self.positions[..., 0]).float() * self.mask
+        return (self.step[..., None] - self.positions[..., 0]).float() * self.mask
 
 
 @dataclass
@@ -206,6 +220,7 @@ class MemoryTokens(TensorStruct):
 
     def __post_init__(self) -> None:
         self.losses = Labels(self.losses)  # rows of the tokens are rows of these
+        check_mask("MemoryTokens.mask", self.mask, self.tokens.shape[:-1])
 
     def logged(self) -> dict[str, Tensor]:
         """The metrics under the names of a training's log, `memory/<name>`."""

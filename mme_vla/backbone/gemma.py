@@ -5,6 +5,8 @@ b batch · n tokens · d an expert's width · N query heads · K key heads · e 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -30,6 +32,7 @@ from mme_vla.backbone.layers import (
     rotation,
     select_rows,
 )
+from mme_vla.errors import UserError
 from mme_vla.speed import Recompute, run_layer
 
 KeyValue = tuple[Tensor, Tensor]
@@ -378,17 +381,27 @@ class JointTransformer(nn.Module):
         """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a
         visibility table.
         """
+        for block in blocks:
+            expert = self.experts.get(block.expert)
+            if expert is None or block.tokens.shape[2:] != (expert.width,):
+                widths = {name: each.width for name, each in self.experts.items()}
+                raise UserError(
+                    f"Block {block.name!r} has tokens {list(block.tokens.shape)} for the expert"
+                    f" {block.expert!r}: the backbone has experts of these widths: {widths}. It is"
+                    " constructed with integration.extra_experts()."
+                )
         spans = [Span(block.name, len(block)) for block in blocks]
         query_mask = torch.cat([block.mask for block in blocks], 1)
         past_mask = None if past is None else past.mask
         positions = apply_custom_positions(rotary_positions(query_mask, past_mask), blocks)
         all_spans = spans
         valid = query_mask
+        dtype = compute_dtype(blocks[0].tokens)
         if past is not None:
             all_spans = past.spans + spans
             valid = torch.cat([past.mask, query_mask], 1)
+            dtype = past.layers[0].k.dtype
         mask_layout = MaskLayout.of(spans, all_spans, valid, table)
-        dtype = compute_dtype(blocks[0].tokens)
         mask = build_mask(mask_layout, dtype, self.attention, self._compiled)
         rope = rotation(positions, self.head_dim)
         return Layout(all_spans, valid, mask, rope, mask_layout, dtype)
@@ -502,11 +515,10 @@ def _segments(blocks: Sequence[Block], dtype: torch.dtype, compiled: bool) -> li
     """Join neighbouring blocks of one expert, in the compute dtype, for layers that are compiled or
     are not.
     """
-    runs: list[tuple[str, list[Tensor]]] = []
-    for block in blocks:
-        if not runs or runs[-1][0] != block.expert:
-            runs.append((block.expert, []))
+    segments = []
+    for expert, run in groupby(blocks, key=attrgetter("expert")):
         # Not a view of something else, as no later layer's tokens are: the first layer then shares
         # their compiled code.
-        runs[-1][1].append(block.tokens.to(dtype, copy=compiled and block.tokens._is_view()))
-    return [Segment(expert, _join(tokens)) for expert, tokens in runs]
+        tokens = [each.tokens.to(dtype, copy=compiled and each.tokens._is_view()) for each in run]
+        segments.append(Segment(expert, _join(tokens)))
+    return segments

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.errors import UserError, check_choice
+from mme_vla.errors import UserError, check_choice, listed
 from mme_vla.speed import fused_kernels
+from mme_vla.types import check_mask
 
 Visibility = Mapping[str, frozenset[str] | set[str]]
 """For each block of queries: the blocks whose keys it may attend to."""
@@ -187,6 +188,9 @@ class Block:
     expert: str
     positions: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        check_mask(f"The mask of block {self.name!r}", self.mask, self.tokens.shape[:-1])
+
     def __len__(self) -> int:
         return self.tokens.shape[1]
 
@@ -216,14 +220,11 @@ def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
     """
     if all(block.positions is None for block in blocks):
         return numbered
-    parts = numbered.float().split([len(block) for block in blocks], 1)
-    positions = []
-    counts = set()
-    for counted, block in zip(parts, blocks, strict=True):
-        part = counted if block.positions is None else block.positions
-        positions.append(part)
-        if part.ndim == 3:
-            counts.add(part.shape[-1])
+    positions = list(numbered.float().split([len(block) for block in blocks], 1))
+    for i, block in enumerate(blocks):
+        if block.positions is not None:
+            positions[i] = block.positions
+    counts = {part.shape[-1] for part in positions if part.ndim == 3}
     if len(counts) > 1:
         raise ValueError(
             f"Blocks have positions of {sorted(counts)} coordinates: all need as many, or one"
@@ -261,12 +262,14 @@ class MaskLayout(NamedTuple):
             table: the visibility table.
         """
         runs: list[tuple[int, list[bool]]] = []
+        # A name without a row is no block of any pass, but a misspelt one.
+        names = {query.name for query in queries}.union(*table.values())
+        if not names <= table.keys():
+            raise UserError(
+                f"No row of the visibility table belongs to {listed(sorted(names - table.keys()))};"
+                f" it has rows {sorted(table)}."
+            )
         for query in queries:
-            if query.name not in table:
-                raise UserError(
-                    f"Block {query.name!r} has no row in the visibility table; it has rows"
-                    f" {sorted(table)}."
-                )
             sees = [key.name in table[query.name] for key in keys]
             if runs and runs[-1][1] == sees:
                 runs[-1] = (runs[-1][0] + query.length, sees)
@@ -276,14 +279,9 @@ class MaskLayout(NamedTuple):
         hidden = [torch.zeros_like(part) for part in parts]
         rows = []
         for _, sees in runs:
-            if all(sees):
-                rows.append(valid)
-                continue
-            row = list(hidden)
-            for i, is_visible in enumerate(sees):
-                if is_visible:
-                    row[i] = parts[i]
-            rows.append(torch.cat(row, 1))
+            # which of two lists each part comes from
+            row = [(parts if is_visible else hidden)[i] for i, is_visible in enumerate(sees)]
+            rows.append(valid if all(sees) else torch.cat(row, 1))
         return cls(tuple(length for length, _ in runs), torch.stack(rows, 1))
 
     def part(self, rows: Sequence[slice]) -> "MaskLayout":
@@ -291,9 +289,7 @@ class MaskLayout(NamedTuple):
         lengths, runs = [], []
         start = 0
         for run, length in enumerate(self.lengths):
-            count = 0
-            for at in rows:
-                count += max(min(at.stop, start + length) - max(at.start, start), 0)
+            count = sum(max(min(r.stop, start + length) - max(r.start, start), 0) for r in rows)
             if count:
                 lengths.append(count)
                 runs.append(run)
@@ -305,9 +301,8 @@ class MaskLayout(NamedTuple):
 
     def expand(self, rows: Tensor) -> Tensor:
         """Values of each run [b, runs, k] for each query [b, n, k]: a view if there is one run."""
-        parts = []
-        for run, length in enumerate(self.lengths):
-            parts.append(rows[:, run, None].expand(-1, length, -1))
+        lengths = enumerate(self.lengths)
+        parts = [rows[:, run, None].expand(-1, length, -1) for run, length in lengths]
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
@@ -384,6 +379,11 @@ def layout_mask(layout: MaskLayout, dtype: torch.dtype) -> Tensor:
 
 
 def _padded(visible: Tensor, dtype: torch.dtype) -> Tensor:
+    if dtype == torch.float16:
+        raise UserError(
+            "torch.float16 is too narrow for this network, its masks and large activations: keep"
+            " float32, or call bfloat16()."
+        )
     *rows, keys = visible.shape
     mask = torch.zeros(*rows, -(-keys // ALIGNMENT) * ALIGNMENT, dtype=dtype, device=visible.device)
     mask[..., :keys].masked_fill_(~visible, BIG_NEGATIVE)

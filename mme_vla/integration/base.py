@@ -1,6 +1,7 @@
 """`Integration`: the one package that knows both memory and backbone."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 from torch import Tensor, nn
@@ -139,9 +140,12 @@ def extension_points(kind: type[Integration]) -> frozenset[str]:
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:
-    """The memory tokens; raises `ValueError` if there are none."""
+    """The memory tokens, zero where the mask is False; raises `ValueError` if there are none.
+
+    What stands there is undefined, even NaN, and attention without a valid key reads all alike.
+    """
     if memory is None:
         raise ValueError(
             "This policy has a memory: batch.history must hold its selection (it is None)."
         )
-    return memory
+    return replace(memory, tokens=memory.tokens.masked_fill(~memory.mask[..., None], 0))

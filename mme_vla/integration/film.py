@@ -45,8 +45,5 @@ class FiLM(PooledIntegration):
 
     def feature(self, memory: MemoryTokens | None) -> Tensor:
         memory = required(memory)
-        mask = memory.mask[..., None]
-        # Tokens where the mask is False are undefined: zero them before they are summed.
-        total = memory.tokens.masked_fill(~mask, 0).sum(1)
-        count = mask.to(memory.tokens.dtype).sum(1).clamp(min=1)
-        return self.out(self.norm(total / count))
+        count = memory.mask.sum(1, keepdim=True).clamp(min=1)
+        return self.out(self.norm(memory.tokens.sum(1) / count))

@@ -22,6 +22,7 @@ from mme_vla.backbone.layers import (
     rotation,
     rounded,
 )
+from mme_vla.errors import check_multiple, check_sizes
 from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
@@ -107,6 +108,11 @@ class Modulator(Integration):
         self.memory_width = backbone.action.width
         self.memory_position = checked_position(memory_position)
         head_dim = head_dim or backbone.head_dim
+        check_sizes(
+            "integration", num_heads=num_heads, num_kv_heads=num_kv_heads, head_dim=head_dim
+        )
+        check_multiple("integration.", "num_heads", num_heads, "num_kv_heads", num_kv_heads)
+        check_multiple("integration.", "head_dim", head_dim, "pairs", 2)  # of a rotation
         self.layers = nn.ModuleList(
             ModulatorLayer(self.memory_width, num_heads, num_kv_heads, head_dim, exact_identity)
             for _ in range(backbone.depth)

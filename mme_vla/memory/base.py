@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import brief, check_choice, require
+from mme_vla.errors import UserError, brief, check_choice, check_sizes, require
 from mme_vla.memory.history import FrameScorer, History, StorageSpec
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens, send
 
@@ -159,7 +159,18 @@ class MemoryModule(nn.Module):
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> HistoryTokens:
         """Select, gather and pad: the unbatched tokens of one step [n, …], ready to be stacked."""
-        indices = self.select(history, step, rng)
+        stored = history.spec
+        if (stored.grid, stored.pooling) != (self.storage.grid, self.storage.pooling):
+            raise UserError(
+                f"{type(self).__name__} reads frames stored as {self.storage}, and the history has"
+                f" {stored}: construct it with memory.storage."
+            )
+        if not 0 <= step < len(history):
+            raise UserError(
+                f"step={step} must be 0 or more and less than {len(history)}, the number of frames"
+                " that the history has seen."
+            )
+        indices = np.asarray(self.select(history, step, rng))
         if len(indices) > self.capacity:
             raise ValueError(
                 f"{type(self).__name__}.select returned {len(indices)} tokens; at most"
@@ -371,15 +382,11 @@ class FeatureEncoder(nn.Module):
         super().__init__()
         self.positions = "time_space" if positions is None else positions
         check_choice("memory.positions", self.positions, POSITIONS)
-        for name, size in (("position_dim", position_dim), ("position_hidden", position_hidden)):
-            require(
-                size is None or size >= 1,
-                f"memory.{name}={size}: must be at least 1, or null for its default.",
-            )
         if position_dim is None:
             position_dim = max(48, 6 * (d_vision // 16))
         if position_hidden is None:
             position_hidden = position_dim
+        check_sizes("memory", position_dim=position_dim, position_hidden=position_hidden)
         self.position_dim = position_dim
         self.position: nn.Linear | None = None
         if self.positions == "none":

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, check_choice, check_sizes, require
+from mme_vla.errors import UserError, brief, check_choice, check_sizes, require
 from mme_vla.types import FrameBatch, send
 
 
@@ -45,15 +45,8 @@ class StorageSpec:
     scorer: str = ""
 
     def __post_init__(self) -> None:
-        check_sizes("memory", grid=self.grid)
+        check_sizes("memory", grid=self.grid, every=self.keep_every)
         check_choice("memory.pooling", self.pooling, ("mean", "max"))
-        every = self.keep_every
-        is_integer = isinstance(every, int) and every >= 1
-        require(
-            is_integer,
-            f"memory: keeping every {every}th frame is not possible: give a whole number, at"
-            " least 1.",
-        )
 
     def stored_frames(self, length: int) -> np.ndarray:
         """Ascending indices of the stored frames among the first `length`."""
@@ -251,12 +244,23 @@ class History:
         """The robot's states at frames [n], normalised: [n, s] float32."""
         return self.motion_rows(frames)[:, : self.state_width]
 
-    def _row_of(self, frames: np.ndarray, stored: np.ndarray) -> np.ndarray:
-        """Rows of frames [n] among the stored ones [m].
+    def _places(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows among the stored frames, and patches, of `indices` [n, 2] of (frame, patch).
 
         Raises:
-            UserError: one of them is not stored.
+            UserError: these are no such indices, or one of the frames is not stored.
         """
+        indices = np.asarray(indices)
+        patches = self.spec.grid**2
+        is_pairs = indices.ndim == 2 and indices.shape[1] == 2 and indices.dtype.kind in "iu"
+        if not is_pairs or ((indices[:, 1] < 0) | (indices[:, 1] >= patches)).any():
+            raise UserError(
+                "A history is read by whole numbers [n, 2], each row a frame and a patch from 0 to"
+                f" {patches - 1}; got {indices.dtype} {list(indices.shape)}:"
+                f" {brief(indices.tolist())}."
+            )
+        frames = indices[:, 0]
+        stored = self.stored_frames
         rows = np.searchsorted(stored, frames)
         # Frames later than all stored ones have a row behind the last, whose frame is −1.
         is_missing = np.append(stored, -1)[rows] != frames
@@ -268,14 +272,21 @@ class History:
                 " as they were rendered. The memory selects frames that its StorageSpec does not"
                 " keep, or that its `frames_read` does not name, which are not rendered."
             )
-        return rows
+        return rows, indices[:, 1].astype(np.int64)
+
+
+MISSING_SCORES = (
+    "The memory chooses by scores of frames ({}), and this history gets none: give"
+    " memory.make_scorer(), or of a CachedHistory its scores, score_frames(…)."
+)
 
 
 class CachedHistory(History):
     """Tokens read from disk: only the rows that a selection names are read.
 
-    tokens: array-like [kept, patches, d_vision] (usually a memory map); bfloat16 is stored as its
-        uint16 bits.
+    tokens: array-like [kept, patches, d_vision] (usually a memory map); an array holds bfloat16 as
+        its uint16 bits.
+    scores: required where the spec names a scorer (`score_frames`).
     """
 
     def __init__(
@@ -288,6 +299,7 @@ class CachedHistory(History):
         exec_start: int = 0,
     ) -> None:
         super().__init__(spec, exec_start)
+        require(scores is not None or not spec.scorer, MISSING_SCORES.format(spec.scorer))
         self._tokens = tokens
         self._stored_frames = stored_frames
         self._length = length
@@ -305,8 +317,7 @@ class CachedHistory(History):
         return self._stored_frames
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        rows = self._row_of(indices[:, 0], self._stored_frames)
-        tokens = torch.from_numpy(np.ascontiguousarray(self._tokens[rows, indices[:, 1]]))
+        tokens = torch.as_tensor(self._tokens[self._places(indices)])
         if tokens.dtype == torch.uint16:
             return tokens.view(torch.bfloat16)
         return tokens
@@ -322,6 +333,7 @@ class OnlineHistory(History):
         self, spec: StorageSpec, scorer: FrameScorer | None = None, exec_start: int = 0
     ) -> None:
         super().__init__(spec, exec_start)
+        require(scorer is not None or not spec.scorer, MISSING_SCORES.format(spec.scorer))
         self._scorer = scorer
         self._length = 0
         self._stored_frames: list[int] = []
@@ -372,10 +384,11 @@ class OnlineHistory(History):
         if count is None:
             count = len(frames)
         offsets = self.to_encode(count, rendered)
-        if len(tokens) != len(offsets):
+        patches = self.spec.grid**2
+        if len(tokens) != len(offsets) or (len(tokens) and tokens.shape[1] != patches):
             raise ValueError(
-                f"append() got tokens of {len(tokens)} frames, expected {len(offsets)}: see"
-                " to_encode()."
+                f"append() got tokens {list(tokens.shape)}, expected [{len(offsets)}, {patches},"
+                " d]: see to_encode() and StorageSpec.grid."
             )
         self._score(frames, np.arange(count) if rendered is None else rendered)
         if len(tokens):
@@ -417,9 +430,8 @@ class OnlineHistory(History):
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:
             raise UserError("The history is empty: observe at least one frame before acting.")
+        rows, patches = map(torch.from_numpy, self._places(indices))
         device = self._tokens.device
-        rows = torch.from_numpy(self._row_of(indices[:, 0], self.stored_frames))
-        patches = torch.from_numpy(indices[:, 1])
         return self._tokens[send(rows, device), send(patches, device)]
 
 
@@ -529,9 +541,9 @@ class LazyHistory(OnlineHistory):
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch), encoding the frames
         that wait.
         """
-        unique_frames, rows = np.unique(indices[:, 0], return_inverse=True)
-        self._row_of(unique_frames, self.stored_frames)  # raises if one is missing
-        frames = unique_frames.tolist()
+        stored_rows, patch = self._places(indices)
+        unique_rows, rows = np.unique(stored_rows, return_inverse=True)
+        frames = self.stored_frames[unique_rows].tolist()
         waiting = [frame for frame in frames if frame in self._waiting]
         if waiting:
             tokens = self._encode(np.stack([self._waiting[frame] for frame in waiting]))
@@ -540,5 +552,4 @@ class LazyHistory(OnlineHistory):
                 del self._waiting[frame]
         encoded = torch.stack([self._encoded[frame] for frame in frames])
         device = encoded.device
-        patches = torch.from_numpy(indices[:, 1])
-        return encoded[send(torch.from_numpy(rows), device), send(patches, device)]
+        return encoded[send(torch.from_numpy(rows), device), send(torch.from_numpy(patch), device)]

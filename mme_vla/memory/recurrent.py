@@ -183,20 +183,15 @@ class RecurrentStream:
     last_step: int | None = None
     pace: int | None = None
 
-    def record_decision(self, step: int) -> None:
-        """Update `last_step` and `pace` at a decision."""
-        if self.last_step is not None and step > self.last_step:
-            self.pace = step - self.last_step
-        self.last_step = step
-
     def longest_start(self, frames: np.ndarray) -> Snapshot:
         """The snapshot that was updated with the longest beginning of these frames; a fresh one
         where there is none. It becomes the last used.
         """
-        matching = []
-        for snapshot in self.snapshots:
-            if np.array_equal(frames[: len(snapshot.frames)], snapshot.frames):
-                matching.append(snapshot)
+        matching = [
+            snapshot
+            for snapshot in self.snapshots
+            if np.array_equal(frames[: len(snapshot.frames)], snapshot.frames)
+        ]
         fresh = Snapshot(frames[:0])
         best = max(matching, key=lambda snapshot: len(snapshot.frames), default=fresh)
         others = [snapshot for snapshot in self.snapshots if snapshot is not best]
@@ -446,7 +441,9 @@ class RecurrentMemory(ScheduledMemory):
         groups: dict[int, list[int]] = defaultdict(list)  # number of new frames → episodes
         for i, (history, stream) in enumerate(zip(histories, streams, strict=True)):
             step = len(history) - 1
-            stream.record_decision(step)
+            if stream.last_step is not None and step > stream.last_step:
+                stream.pace = step - stream.last_step
+            stream.last_step = step
             frames = self.frames(history, step)
             snapshot = stream.longest_start(frames)
             new = frames[len(snapshot.frames) :]
@@ -538,7 +535,9 @@ def layer_norm(norm: nn.LayerNorm, x: Tensor) -> Tensor:
 
 def default_hidden(d_vision: int, hidden: int | None) -> int:
     """A quarter of the vision width, at least 64: 512 at full size, as released."""
-    return hidden or max(64, d_vision // 4)
+    hidden = hidden or max(64, d_vision // 4)
+    check_sizes("memory", hidden=hidden)
+    return hidden
 
 
 def _advance_with(

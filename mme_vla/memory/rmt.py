@@ -184,11 +184,11 @@ class RMT(RecurrentMemory):
             attention_dtype: what queries, keys and values are cast to; `bfloat16` as released;
                 `float32` takes the fused kernel, which keeps no weights: less memory.
         """
-        check_sizes("memory", budget=budget)
         hidden = default_hidden(d_vision, hidden)
         if not heads:
             heads = max(2, hidden // 64)
             while heads > 1 and hidden % (2 * heads):
                 heads -= 1
+        check_sizes("memory", budget=budget, heads=heads, kv_heads=kv_heads)
         layer = RMTLayer(hidden, heads, kv_heads, budget, rotation, attention_dtype)
         super().__init__(d_vision, width, layer, hidden, budget, **options)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import require
+from mme_vla.errors import check_sizes, require
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
     RecurrentMemory,
@@ -238,6 +238,7 @@ class TTT(RecurrentMemory):
             f"memory.budget={budget} must lie between 1 and memory.max_steps × grid² ="
             f" {max_steps * grid**2}: TTT returns one token for each that it reads.",
         )
+        check_sizes("memory", budget=budget, heads=heads)
         hidden = default_hidden(d_vision, hidden)
         layer = TTTLayer(hidden, heads, budget, grid**2, base_rate, max_rate, max_grad_norm)
         super().__init__(

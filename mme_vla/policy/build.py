@@ -70,10 +70,9 @@ def check_integrated(
             )
         return
     if takes_tokens and memory.budget == 0:
-        name = PolicySections.of(config).memory.get("name")
         raise UserError(
-            f"The memory {name!r} produces no tokens with these settings."
-            " Set integration=none or memory.states=true."
+            f"The memory {PolicySections.of(config).memory.get('name')!r} produces no tokens with"
+            " these settings. Set integration=none or memory.states=true."
         )
     if not takes_tokens and memory.budget > 0:
         raise UserError(

@@ -244,14 +244,9 @@ class MMEPolicy(NetworkPolicy, Recomputes):
             The loss and its metrics. Auxiliary losses are `losses/<name>`, unweighted. The memory's
             own begin with `memory/` and are present while `memory.reporting`.
         """
-        if batch.actions is None:
-            raise ValueError(
-                "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
-                " None)."
-            )
         # The random numbers of the loss and of the augmentation: as given, the others sampled.
-        count, generator = len(batch.actions), torch.default_generator
-        draws = named_noise(noise, time=time)
+        count, generator = len(batch.prompt), torch.default_generator
+        draws = named_noise(noise, time)
         is_complete = isinstance(noise, Mapping) or (noise is not None and time is not None)
         if not draws or not is_complete:
             draws = self.training_noise(count, generator) | draws

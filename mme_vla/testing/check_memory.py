@@ -236,25 +236,15 @@ def select_frames(
             " history.stored_frames."
         )
     selection = selection.copy()  # `select` may fill one array again and again
-    check_length(memory, history, step, _rng(seed))
+    try:
+        memory.gather_selection(history, step, _rng(seed))
+    except ValueError as error:  # more than `capacity`
+        raise AssertionError(str(error)) from error
     return selection
 
 
 def _rng(seed: int | None) -> np.random.Generator | None:
     return None if seed is None else np.random.default_rng(seed)
-
-
-def check_length(
-    memory: Memory, history: History, step: int, rng: np.random.Generator | None = None
-) -> None:
-    """A selection has at most `capacity` tokens."""
-    try:
-        length = len(memory.gather_selection(history, step, rng).mask)
-    except ValueError as error:
-        raise AssertionError(str(error)) from error
-    assert length <= memory.capacity, (
-        f"gather_selection returned {length} tokens; capacity is {memory.capacity}."
-    )
 
 
 @torch.no_grad()
@@ -284,9 +274,6 @@ def check_form(memory: Memory, encoded: MemoryTokens, batch: int) -> None:
     )
     assert encoded.tokens.dtype == torch.float32, (
         f"tokens must be of the weights' dtype, float32; got {encoded.tokens.dtype}."
-    )
-    assert encoded.mask.shape == shape[:2] and encoded.mask.dtype == torch.bool, (
-        f"the mask must be bool {shape[:2]}; got {encoded.mask.dtype} {tuple(encoded.mask.shape)}."
     )
     assert encoded.mask.any(1).all(), "a row has no valid memory token."
     assert torch.isfinite(encoded.tokens[encoded.mask]).all(), "a valid memory token is not finite."

@@ -49,7 +49,7 @@ def test_a_subset_of_the_queries_has_the_mask_rows_of_all_queries() -> None:
 
 
 def test_a_block_without_a_row_is_named() -> None:
-    with pytest.raises(UserError, match="'sounds' has no row"):
+    with pytest.raises(UserError, match="No row of the visibility table belongs to sounds"):
         MaskLayout.of(
             [Span("sounds", 2)],
             [Span("images", 2)],

@@ -187,7 +187,7 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "no batch axis in encode": (
         streamed_by(
             lambda tokens: (
-                replace(tokens, tokens=tokens.tokens[0]) if len(tokens.tokens) == 1 else tokens
+                MemoryTokens(tokens.tokens[0], tokens.mask[0]) if len(tokens.mask) == 1 else tokens
             )
         ),
         "must return tokens",
@@ -195,7 +195,7 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "no batch axis": (
         encoded_by(
             lambda memory, history, tokens: (
-                tokens if len(tokens.tokens) > 1 else replace(tokens, tokens=tokens.tokens[0])
+                tokens if len(tokens.mask) > 1 else MemoryTokens(tokens.tokens[0], tokens.mask[0])
             )
         ),
         "must return tokens",

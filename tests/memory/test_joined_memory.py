@@ -129,7 +129,7 @@ def test_members_that_store_nothing_ask_nothing_of_the_storage() -> None:
         ),
         (["tokendrop", {"name": "tokendrop", "stride": 4}], "the same grid and stride"),
         (["framesamp", "tttt"], "ttt"),
-        ([{**FRAMES, "every": 7.5}, TTT], "every 7.5th frame"),
+        ([{**FRAMES, "every": 7.5}, TTT], r"memory\.every=7\.5 must be at least 1"),
         ([{**FRAMES, "grid": 0}, TTT], "memory.grid=0 must be at least 1"),
     ],
 )

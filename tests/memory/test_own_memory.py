@@ -124,11 +124,6 @@ def test_a_selection_with_a_patch_twice_fails_the_check(rules, monkeypatch):
         ),
         (
             "forward",
-            lambda memory, history: MemoryTokens(torch.ones(2, 16, 48), history.mask.float()),
-            r"bool \(2, 16\); got torch.float32 \(2, 16\)",
-        ),
-        (
-            "forward",
             lambda memory, history: MemoryTokens(
                 torch.ones(2, 16, 48), history.mask, ages=torch.ones(2)
             ),

@@ -20,6 +20,7 @@ from mme_vla.extras.probing.evidence import EvidenceEpisode
 from mme_vla.memory.base import MemoryModule, stack_history
 from mme_vla.memory.history import (
     CachedHistory,
+    FrameScores,
     History,
     TokenlessHistory,
     TokensReadError,
@@ -297,7 +298,8 @@ def reads_tokens(memory: MemoryModule) -> bool:
     frames.
     """
     stored = memory.storage.stored_frames(LONGEST)
-    history = CachedHistory(memory.storage, np.zeros(0), stored, LONGEST)
+    unscored = FrameScores.empty(memory.storage.grid**2)
+    history = CachedHistory(memory.storage, np.zeros(0), stored, LONGEST, unscored)
     history.motion, history.state_width = torch.zeros(LONGEST, 8).__getitem__, 8
     try:
         selected_frames(memory, TokenlessHistory(history), LONGEST - 1)
