@@ -5,8 +5,6 @@ b batch · n tokens · d an expert's width · N query heads · K key heads · e 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -515,10 +513,11 @@ def _segments(blocks: Sequence[Block], dtype: torch.dtype, compiled: bool) -> li
     """Join neighbouring blocks of one expert, in the compute dtype, for layers that are compiled or
     are not.
     """
-    segments = []
-    for expert, run in groupby(blocks, key=attrgetter("expert")):
+    runs: list[tuple[str, list[Tensor]]] = []
+    for block in blocks:
+        if not runs or runs[-1][0] != block.expert:
+            runs.append((block.expert, []))
         # Not a view of something else, as no later layer's tokens are: the first layer then shares
         # their compiled code.
-        tokens = [each.tokens.to(dtype, copy=compiled and each.tokens._is_view()) for each in run]
-        segments.append(Segment(expert, _join(tokens)))
-    return segments
+        runs[-1][1].append(block.tokens.to(dtype, copy=compiled and block.tokens._is_view()))
+    return [Segment(expert, _join(tokens)) for expert, tokens in runs]

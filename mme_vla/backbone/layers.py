@@ -220,11 +220,14 @@ def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
     """
     if all(block.positions is None for block in blocks):
         return numbered
-    positions = list(numbered.float().split([len(block) for block in blocks], 1))
-    for i, block in enumerate(blocks):
-        if block.positions is not None:
-            positions[i] = block.positions
-    counts = {part.shape[-1] for part in positions if part.ndim == 3}
+    parts = numbered.float().split([len(block) for block in blocks], 1)
+    positions = []
+    counts = set()
+    for counted, block in zip(parts, blocks, strict=True):
+        part = counted if block.positions is None else block.positions
+        positions.append(part)
+        if part.ndim == 3:
+            counts.add(part.shape[-1])
     if len(counts) > 1:
         raise ValueError(
             f"Blocks have positions of {sorted(counts)} coordinates: all need as many, or one"
@@ -279,9 +282,14 @@ class MaskLayout(NamedTuple):
         hidden = [torch.zeros_like(part) for part in parts]
         rows = []
         for _, sees in runs:
-            # which of two lists each part comes from
-            row = [(parts if is_visible else hidden)[i] for i, is_visible in enumerate(sees)]
-            rows.append(valid if all(sees) else torch.cat(row, 1))
+            if all(sees):
+                rows.append(valid)
+                continue
+            row = list(hidden)
+            for i, is_visible in enumerate(sees):
+                if is_visible:
+                    row[i] = parts[i]
+            rows.append(torch.cat(row, 1))
         return cls(tuple(length for length, _ in runs), torch.stack(rows, 1))
 
     def part(self, rows: Sequence[slice]) -> "MaskLayout":
@@ -289,7 +297,9 @@ class MaskLayout(NamedTuple):
         lengths, runs = [], []
         start = 0
         for run, length in enumerate(self.lengths):
-            count = sum(max(min(r.stop, start + length) - max(r.start, start), 0) for r in rows)
+            count = 0
+            for at in rows:
+                count += max(min(at.stop, start + length) - max(at.start, start), 0)
             if count:
                 lengths.append(count)
                 runs.append(run)
@@ -301,8 +311,9 @@ class MaskLayout(NamedTuple):
 
     def expand(self, rows: Tensor) -> Tensor:
         """Values of each run [b, runs, k] for each query [b, n, k]: a view if there is one run."""
-        lengths = enumerate(self.lengths)
-        parts = [rows[:, run, None].expand(-1, length, -1) for run, length in lengths]
+        parts = []
+        for run, length in enumerate(self.lengths):
+            parts.append(rows[:, run, None].expand(-1, length, -1))
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 

@@ -244,7 +244,7 @@ class History:
         """The robot's states at frames [n], normalised: [n, s] float32."""
         return self.motion_rows(frames)[:, : self.state_width]
 
-    def _places(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _rows_of(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows among the stored frames, and patches, of `indices` [n, 2] of (frame, patch).
 
         Raises:
@@ -317,7 +317,7 @@ class CachedHistory(History):
         return self._stored_frames
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        tokens = torch.as_tensor(self._tokens[self._places(indices)])
+        tokens = torch.as_tensor(self._tokens[self._rows_of(indices)])
         if tokens.dtype == torch.uint16:
             return tokens.view(torch.bfloat16)
         return tokens
@@ -430,7 +430,7 @@ class OnlineHistory(History):
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:
             raise UserError("The history is empty: observe at least one frame before acting.")
-        rows, patches = map(torch.from_numpy, self._places(indices))
+        rows, patches = map(torch.from_numpy, self._rows_of(indices))
         device = self._tokens.device
         return self._tokens[send(rows, device), send(patches, device)]
 
@@ -541,7 +541,7 @@ class LazyHistory(OnlineHistory):
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch), encoding the frames
         that wait.
         """
-        stored_rows, patch = self._places(indices)
+        stored_rows, patch = self._rows_of(indices)
         unique_rows, rows = np.unique(stored_rows, return_inverse=True)
         frames = self.stored_frames[unique_rows].tolist()
         waiting = [frame for frame in frames if frame in self._waiting]

@@ -1,4 +1,4 @@
-"""Backbone, memory and integration put together by hand: what masks mean, and mistakes by name."""
+"""Backbone, memory and integration without a policy: what masks mean, and mistakes by name."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +13,6 @@ from mme_vla.backbone.layers import PI05_VISIBILITY, Block
 from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.integration.base import Integration
 from mme_vla.integration.context import Context, MemoryExpert
-from mme_vla.integration.film import FiLM
 from mme_vla.integration.modulator import Modulator
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.rmt import RMT
@@ -90,19 +89,8 @@ def test_actions_do_not_depend_on_undefined_memory_tokens(
     assert torch.equal(chunks[0], chunks[1]) and torch.equal(chunks[0], chunks[2])
 
 
-def test_film_is_the_mean_of_the_valid_tokens() -> None:
-    integration = FiLM(None, width=8)
-    mask = torch.tensor([[True, True, False], [False, False, False]])
-    tokens = torch.randn(2, 3, 8, generator=torch.Generator().manual_seed(0))
-    feature = integration.feature(
-        MemoryTokens(tokens.masked_fill(~mask[..., None], float("nan")), mask)
-    )
-    mean = torch.stack([tokens[0, :2].mean(0), torch.zeros(8)])
-    torch.testing.assert_close(feature, integration.out(integration.norm(mean)))
-
-
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32])
-def test_a_mask_that_is_not_bool_is_named_wherever_it_is_given(dtype: torch.dtype) -> None:
+def test_a_mask_that_is_not_bool_is_named_at_every_place(dtype: torch.dtype) -> None:
     model, mask = small_model(), torch.ones(2, BUDGET, dtype=dtype)
     tokens = torch.zeros(2, BUDGET, 32)
     with pytest.raises(ValueError, match=rf"HistoryTokens.mask is {dtype} \[2, 16\]"):
@@ -147,18 +135,18 @@ def test_parts_of_other_sizes_are_named() -> None:
         without_expert(batch, noise_of(model))
 
 
-def written(
+def adding(
     block: Callable[[MemoryTokens], Block], visibility: Mapping[str, set[str]]
 ) -> type[Integration]:
-    class Written(Integration):
+    class Adding(Integration):
         memory_width = 16
 
         def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
             assert memory is not None
             return [block(memory), *observation]
 
-    Written.visibility = {**PI05_VISIBILITY, **visibility}
-    return Written
+    Adding.visibility = {**PI05_VISIBILITY, **visibility}
+    return Adding
 
 
 @pytest.mark.parametrize(
@@ -173,7 +161,7 @@ def written(
 def test_a_block_in_no_expert_or_of_no_row_is_named(
     expert: str, visibility: Mapping[str, set[str]], message: str
 ) -> None:
-    kind = written(lambda memory: Block("notes", memory.tokens, memory.mask, expert), visibility)
+    kind = adding(lambda memory: Block("notes", memory.tokens, memory.mask, expert), visibility)
     model = small_model(kind)
     with pytest.raises(UserError, match=message):
         model(two_samples(), noise_of(model))

@@ -1,4 +1,4 @@
-"""Reading a history by hand: indices of any whole numbers, and mistakes by name."""
+"""Reading a history without an episode: indices of any integers, and mistakes by name."""
 
 from typing import Any
 
@@ -44,7 +44,7 @@ KINDS = ["cached", "online", "lazy"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_indices_of_any_whole_numbers_read_the_same_tokens(kind: str) -> None:
+def test_indices_of_any_integers_read_the_same_tokens(kind: str) -> None:
     history = history_of(kind)
     expected = TOKENS[PAIRS[:, 0], PAIRS[:, 1]]
     for dtype in (np.int64, np.int32, np.uint8, np.uint64):
@@ -80,7 +80,7 @@ def test_a_step_outside_of_the_history_is_refused(kind: str, step: int) -> None:
         memory.gather_selection(history_of(kind), step)
 
 
-def test_a_selection_of_any_whole_numbers_is_gathered() -> None:
+def test_a_selection_of_any_integers_is_gathered() -> None:
     class Listed(FrameSamp):
         def select(self, *arguments: Any) -> Any:
             return super().select(*arguments).astype(np.uint8).tolist()

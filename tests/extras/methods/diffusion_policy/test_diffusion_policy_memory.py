@@ -100,11 +100,12 @@ def test_padding_of_a_short_memory_counts_for_nothing(policy: DiffusionPolicy) -
     mask = torch.zeros_like(full.mask)
     mask[:, :32] = True
     outputs = []
-    for filling in (0.0, 7.0):
+    for filling in (0.0, 7.0, float("nan")):
         features = full.features.masked_fill(~mask[..., None], filling)
         tokens = policy.encode_memory(HistoryTokens(features, full.positions, mask))
         outputs.append(policy.integration.feature(tokens))
     assert torch.allclose(outputs[0], outputs[1], atol=1e-6)
+    assert torch.allclose(outputs[0], outputs[2], atol=1e-6)
 
 
 def test_it_trains_on_cached_tokens(tmp_path: Path) -> None:
