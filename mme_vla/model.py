@@ -42,7 +42,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import Backbone, Injection
-from mme_vla.backbone.layers import autocast
+from mme_vla.backbone.layers import Block, autocast
 from mme_vla.errors import UserError, check_integer, check_known
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule, encode_selection
@@ -156,15 +156,7 @@ class MMEModel(nn.Module):
         if memory is not None:
             check_tokens(memory, len(batch.prompt), self.memory, self.integration.memory_width)
         injection = self.integration.inject(self.backbone.embed(batch), memory)
-        for block in injection.blocks:
-            if block.positions is not None and "positions" not in self.backbone.supports:
-                kind = type(self.backbone).__name__
-                raise UserError(
-                    f"The block {block.name!r} has positions {list(block.positions.shape)}, and"
-                    f" {kind} counts tokens in causal order. Allowed here is Block.positions=None."
-                    " A backbone whose `supports` has 'positions', such as backbone=pi05, takes"
-                    " others."
-                )
+        check_positions(injection.blocks, self.backbone)
         return injection
 
     # Loss and samples
@@ -304,6 +296,18 @@ class MMEModel(nn.Module):
     def autocast(self) -> torch.autocast:
         """The autocast context of all network code."""
         return autocast(self.device, self.compute_dtype)
+
+
+def check_positions(blocks: Sequence[Block], backbone: Backbone) -> None:
+    """Raise an error if blocks bring positions to a backbone that numbers tokens itself."""
+    for block in blocks:
+        if block.positions is not None and "positions" not in backbone.supports:
+            raise UserError(
+                f"The block {block.name!r} has positions {list(block.positions.shape)}, and"
+                f" {type(backbone).__name__} counts tokens in causal order. Allowed here is"
+                " Block.positions=None. A backbone whose `supports` has 'positions', such as"
+                " backbone=pi05, takes others."
+            )
 
 
 def check_shape(what: str, values: Tensor | None, shape: Sequence[int]) -> None:
