@@ -29,7 +29,12 @@ from mme_vla.data.lerobot_files import SAMPLE, find_columns, read_info, resolve_
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.recording import Recording, action_offset_of
 from mme_vla.data.robot_draft import CHECK, draft_robot, save_draft
-from mme_vla.data.sources import default_val_episodes, held_out_in, listed_sources
+from mme_vla.data.sources import (
+    compare_episodes,
+    default_val_episodes,
+    held_out_in,
+    listed_sources,
+)
 from mme_vla.data.statistics import normalised_states
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, counted, printable, require
@@ -323,6 +328,7 @@ MOST_EPISODES = 40  # in the table of a dataset
 
 def show_dataset(source: EpisodeSource, console: Console) -> None:
     """Print a dataset's episodes, at most `MOST_EPISODES` of them, and its totals."""
+    compare_episodes([source])
     compared = source.verify()
     table = titled_table(
         f"{source.name} ({source.root})",

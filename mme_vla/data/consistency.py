@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.episode_table import Description
+from mme_vla.data.hdf5 import is_goal
 from mme_vla.data.image_consistency import (
     CORRECT,
     HALF,
@@ -62,7 +63,7 @@ class FrameTasks:
 
 def check_consistency(
     dataset: Description, rows: Mapping[str, np.ndarray], table: Any
-) -> FrameTasks:
+) -> tuple[FrameTasks, np.ndarray | None]:
     """Compare everything that a dataset says twice.
 
     Args:
@@ -70,14 +71,15 @@ def check_consistency(
         table: of `open_table`; only first pictures are read from it.
 
     Returns:
-        The task of every frame.
+        The task of every frame, and the first execution frame of each episode, [e] int64, where
+        the rows tell it.
 
     Raises:
         UserError: two places contradict each other; it names both, and the first episode or row.
     """
     _check_totals(dataset)
     _check_rows(dataset, rows)
-    _check_phases(dataset, rows)
+    exec_starts = _read_starts(dataset, rows)
     _check_side_file(dataset, rows)
     tasks = _find_tasks(dataset, rows)
     for column in (*dataset.videos, *dataset.images):
@@ -86,7 +88,7 @@ def check_consistency(
         check_videos(dataset, column)
     for column in dataset.images:
         check_images(dataset, column, table)
-    return tasks
+    return tasks, exec_starts
 
 
 def _check_totals(dataset: Description) -> None:
@@ -133,29 +135,15 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
         f" {REMEDY}",
     )
     episodes = np.repeat(np.arange(len(lengths)), lengths)
-    row = first_wrong(index != episodes)
-    if row is not None:
-        raise UserError(
-            f"{root}: row {row} has episode_index {index[row]}; by meta/episodes it is of episode"
-            f" {episodes[row]}. The dataset is incomplete or mixed up. {REMEDY}"
-        )
     places = np.arange(total)
     frames = places - dataset.starts[episodes]
-    if "frame_index" in rows:
-        row = first_wrong(rows["frame_index"] != frames)
+    for name, expected in (("episode_index", episodes), ("frame_index", frames), ("index", places)):
+        row = first_wrong(rows.get(name, expected) != expected)
         if row is not None:
             raise UserError(
-                f"{root}: {dataset.place(row)}, has frame_index {rows['frame_index'][row]}; by its"
-                f" place it is {frames[row]}. Frames are missing, twice there or out of order, so"
-                " that actions would not follow each other. Expected 0, 1, 2, … in every episode."
-                f" {CORRECT}"
-            )
-    if "index" in rows:
-        row = first_wrong(rows["index"] != places)
-        if row is not None:
-            raise UserError(
-                f"{root}: {dataset.place(row)}, has index {rows['index'][row]}; expected {row}, its"
-                f" place in the tables. {CORRECT}"
+                f"{root}: {dataset.place(row)}, has {name} {rows[name][row]}; by its place it is"
+                f" {expected[row]}. Frames are missing, twice there or out of order, so that"
+                f" actions would not follow each other. {CORRECT}"
             )
     if "timestamp" in rows:
         off = ~(np.abs(rows["timestamp"] * fps - frames) <= HALF)  # not a number is off as well
@@ -169,9 +157,9 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
             )
 
 
-def _check_phases(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
-    """Compare the two columns that say where a conditioning video ends, each with itself too. Flags
-    are 0 or 1.
+def _read_starts(dataset: Description, rows: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Where conditioning videos end, by the two columns that say it, compared with each other and
+    each with itself. Flags are 0 or 1.
     """
     for name, values in rows.items():
         if name != "is_demo" and not name.endswith(RENDERED_SUFFIX):
@@ -182,22 +170,27 @@ def _check_phases(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
                 f"{dataset.root}: {dataset.place(row)}, has {name} {values[row]}; expected true or"
                 f" false. {REMEDY}"
             )
-    if "exec_start_idx" not in rows:
-        return
-    declared = rows["exec_start_idx"]
+    exec_starts = None
+    other = "{} at the first frame of the episode, which has one such number"
+    if "exec_start_idx" in rows:
+        exec_starts = rows["exec_start_idx"][dataset.starts]
     if "is_demo" in rows:
-        counts = np.add.reduceat(rows["is_demo"], dataset.starts)
+        exec_starts = np.add.reduceat(rows["is_demo"], dataset.starts)
         other = "is_demo marks the first {} frames of the episode as its conditioning video"
-    else:
-        counts = declared[dataset.starts]
-        other = "{} at the first frame of the episode, which has one such number"
-    expected = np.repeat(counts, dataset.lengths)
-    row = first_wrong(declared != expected)
-    if row is not None:
-        raise UserError(
-            f"{dataset.root}: {dataset.place(row)}, has exec_start_idx {declared[row]}, but"
-            f" {other.format(expected[row])}. {CORRECT}"
-        )
+        frames = np.arange(len(rows["is_demo"])) - np.repeat(dataset.starts, dataset.lengths)
+        if ((frames < np.repeat(exec_starts, dataset.lengths)) != rows["is_demo"]).any():
+            raise UserError(
+                f"{dataset.root}: is_demo must be true for an episode's first frames only."
+            )
+    if exec_starts is not None and "exec_start_idx" in rows:
+        expected = np.repeat(exec_starts, dataset.lengths)
+        row = first_wrong(rows["exec_start_idx"] != expected)
+        if row is not None:
+            raise UserError(
+                f"{dataset.root}: {dataset.place(row)}, has exec_start_idx"
+                f" {rows['exec_start_idx'][row]}, but {other.format(expected[row])}. {CORRECT}"
+            )
+    return exec_starts
 
 
 def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
@@ -266,12 +259,12 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
 
 
 def _goals(root: Path, texts: Sequence[str]) -> tuple[str, ...]:
-    """Goals as they are trained on, lower-case; an empty one tells a policy nothing."""
+    """Goals as they are trained on, lower-case."""
     for text in set(texts):
         require(
-            text.strip(),
-            f"{root}: the task {brief(text)} is empty (in {TASKS} or meta/episodes), and a policy"
-            " is told what to do in words. Write the task there.",
+            is_goal(text),
+            f"{root}: the task {brief(text)} is empty or holds control characters (in {TASKS} or"
+            " meta/episodes), and a policy is told what to do in words. Write the task there.",
         )
     spelled = {text: text.lower() for text in set(texts)}  # one text in memory for all its runs
     return tuple(spelled[text] for text in texts)
@@ -340,6 +333,19 @@ def compare_units(
             units[d],
             beyond.sum(),
         )
+
+
+UNITS_APART = 20
+"""How many times larger numbers are than others where units differ: 57 from radians to degrees."""
+
+
+def have_other_units(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether the sizes of the same numbers [w] differ so much in most of them; those that never
+    move do not count.
+    """
+    moving = (first > 0) & (second > 0)
+    apart = np.abs(np.log(first[moving] / second[moving])) >= np.log(UNITS_APART)
+    return bool(2 * apart.sum() > len(apart))
 
 
 def named_alike(name: str) -> str:

@@ -19,6 +19,7 @@ from mme_vla.data.consistency import (
     compare_names,
     compare_stats,
     compare_units,
+    have_other_units,
 )
 from mme_vla.data.episode_table import Description, read_episode_table
 from mme_vla.data.frame_tables import check_vectors, flat, open_table, read_index_columns
@@ -58,7 +59,6 @@ class EpisodeSource:
     state_names, action_names: what the dataset calls the numbers of the state and of the action;
         may be empty.
     tasks: which task each frame has.
-    scales: of the state and of the action, the greatest size of each number, [w] float64.
     starts: [e] int64, rows of the tables at which episodes begin.
     lengths: [e] int64, frames of each episode.
     exec_starts: [e] int64, its first execution frame (0 without a video).
@@ -114,20 +114,16 @@ class EpisodeSource:
         for kind, names in vectors.items():
             self._vectors_of[kind] = {name: features[name].width for name in names}
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
-        videos: dict[str, str] = {}
-        images: list[str] = []
-        self.lossy: dict[str, str] = {}
+        is_video = {name: features[name].dtype == "video" for name in self.columns.values()}
+        videos = tuple(column for column, is_one in is_video.items() if is_one)
+        images = tuple(column for column, is_one in is_video.items() if not is_one)
+        self.video_cameras = tuple(name for name in self.columns if self.columns[name] in videos)
+        self.lossy = {
+            camera: coding
+            for camera in self.video_cameras
+            if (coding := features[self.columns[camera]].lossy_coding) is not None
+        }
         """Of cameras whose videos lost something when they were made: how they were coded."""
-        for camera, column in self.columns.items():
-            if features[column].dtype != "video":
-                images.append(column)
-                continue
-            videos[camera] = column
-            coding = features[column].lossy_coding
-            if coding is not None:
-                self.lossy[camera] = coding
-        self.video_cameras = tuple(videos)
-        video_columns = tuple(dict.fromkeys(videos.values()))
 
         # Checksums of what every opening reads anyway; tables that hold images are left to
         # `verify`.
@@ -136,35 +132,35 @@ class EpisodeSource:
         sums.check(*(name for name in sums.table if name.startswith(opened)))
 
         # Episodes and rows.
-        self._episodes = read_episode_table(self.root, video_columns)
+        self._episodes = read_episode_table(self.root, videos)
         self.starts = self._episodes.starts
         self.lengths = self._episodes.lengths
         self._video_path = info.video_path
         self._reader = VideoReader(max_open_videos)
         self._motions: dict[int, Motions] = {}
-        image_columns = tuple(dict.fromkeys(images))
         rendered = {camera: f"{camera}{RENDERED_SUFFIX}" for camera in self.columns}
         flags = ["is_demo", "exec_start_idx", *rendered.values()]
         rows = read_index_columns(self.root, features, flags)
         self._table = open_table(self.root, columns, features)
-        self.tasks = check_consistency(
-            Description(self.root, info, self._episodes, video_columns, image_columns),
+        self.tasks, in_tables = check_consistency(
+            Description(self.root, info, self._episodes, videos, images),
             rows,
             self._table,
         )
         side_file = None if exec_starts is None else Path(exec_starts)
-        self.exec_starts = self._read_exec_starts(rows, side_file)
-        self._rendered: dict[str, np.ndarray] = {}
-        for camera, column in rendered.items():
-            if column in rows:
-                self._rendered[camera] = rows[column].astype(bool)
+        self.exec_starts = self._read_exec_starts(rows, in_tables, side_file)
+        self._rendered = {
+            camera: rows[column].astype(bool)
+            for camera, column in rendered.items()
+            if column in rows
+        }
 
-        self.scales = self._read_scales()
-        action = self.robot.action
-        compare_units(self.root, action.names, action.units, self.scales["action"])
+        self._check_vectors()
 
-    def _read_scales(self) -> dict[str, np.ndarray]:
-        """Check all vectors against their statistics; returns the greatest size of each number."""
+    def _check_vectors(self) -> None:
+        """Compare all vectors with their statistics, and the sizes of their numbers with the units
+        and with each other.
+        """
         scales: dict[str, np.ndarray] = {}
         for kind, vectors in self._vectors_of.items():
             sizes = []
@@ -174,7 +170,18 @@ class EpisodeSource:
                 sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
             if sizes:
                 scales[kind] = np.concatenate(sizes)
-        return scales
+        action = self.robot.action
+        compare_units(self.root, action.names, action.units, scales["action"])
+        places = list(action.relative)
+        sizes = [scales[kind][places] for kind in ("state", "action")]
+        if have_other_units(*sizes):
+            raise UserError(
+                f"{self.root}: numbers {listed(place + 1 for place in places)} reach"
+                f" {brief(sizes[0].tolist())} in the state and {brief(sizes[1].tolist())} in the"
+                " action, which is predicted relative to the state: both need one unit (degrees and"
+                " radians differ by 57), and the action has to be a position, no difference."
+                " Convert one of them, or set embodiment.action.relative=[]."
+            )
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -481,19 +488,11 @@ class EpisodeSource:
         )
 
     def _read_exec_starts(
-        self, rows: Mapping[str, np.ndarray], side_file: Path | None
+        self,
+        rows: Mapping[str, np.ndarray],
+        in_tables: np.ndarray | None,
+        side_file: Path | None,
     ) -> np.ndarray:
-        in_tables = None
-        if "is_demo" in rows:
-            demo = rows["is_demo"].astype(bool)
-            in_tables = np.add.reduceat(demo, self.starts, dtype=np.int64)
-            frame = np.arange(len(demo)) - np.repeat(self.starts, self.lengths)
-            if not np.array_equal(demo, frame < np.repeat(in_tables, self.lengths)):
-                raise UserError(
-                    f"{self.root}: is_demo must be true for an episode's first frames only."
-                )
-        elif "exec_start_idx" in rows:
-            in_tables = rows["exec_start_idx"][self.starts]
         if side_file is not None:
             starts = read_exec_starts(side_file, len(self))
             if in_tables is not None and not np.array_equal(starts, in_tables):

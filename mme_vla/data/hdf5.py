@@ -26,6 +26,9 @@ from mme_vla.utils import decoding, parse_json, require_file
 
 REMEDY = "Download or copy the file again."
 
+is_goal = re.compile(r"(?=.*\w)[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]+", re.DOTALL).fullmatch
+"""Whether a text tells what to do: it has a word, and no control characters but ends of lines."""
+
 
 @dataclass(frozen=True)
 class EpisodeRef:
@@ -65,6 +68,17 @@ CHOICES = (
     "timestep_0/info/is_subgoal_boundary",
 )
 """What an episode has whose options and choices were recorded."""
+_LIMITS = {
+    "obs/joint_state": np.full(7, 20.0),
+    "obs/gripper_state": np.full(2, 0.1),
+    f"obs/{POSE_STATE}": np.full(POSE_WIDTH, 20.0),
+    "action/joint_action": np.array([20.0] * 7 + [1.0]),
+    "action/eef_action": np.array([20.0] * POSE_WIDTH + [1.0]),
+    "action/waypoint_action": np.array([20.0] * POSE_WIDTH + [1.0]),
+}
+"""The vectors of a step: the greatest size that each number can have, in radians and metres; a
+gripper's command lies between −1 and 1. Degrees, millimetres and quaternions do not fit.
+"""
 FRAMES = "setup/frames"
 """Where a file keeps the choice of frames it was recorded at, as JSON, if not all were rendered."""
 _IMAGE_KEYS = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
@@ -165,25 +179,29 @@ class RawEpisode:
             raise UserError(f"{self._path(name)} holds {value}; expected {expected}. {REMEDY}")
         return array
 
-    def _numbers(self, step: int, name: str, count: int, absent: bool = False) -> np.ndarray:
-        """The first `count` numbers of a step's array; with `absent` all of them may be NaN."""
-        expected = f"at least {count} finite numbers within float32"
+    def _numbers(self, step: int, name: str, absent: bool = False) -> np.ndarray:
+        """A vector of `_LIMITS` at a step; with `absent` all of it may be NaN."""
+        limits = _LIMITS[name]
+        expected = (
+            f"{len(limits)} floating-point numbers of sizes up to {limits.tolist()} (radians,"
+            " metres, a gripper's command from −1 to 1)"
+        )
         if absent:
             expected += ", or NaN alone"
 
         def is_valid(numbers: np.ndarray) -> bool:
-            if numbers.ndim > 1 or numbers.size < count:
+            if numbers.shape != limits.shape or numbers.dtype.kind != "f":
                 return False
-            with np.errstate(over="ignore"):
-                is_finite = np.isfinite(numbers.astype(np.float32)).all()
-            return bool(is_finite or (absent and np.isnan(numbers).all()))
+            is_within = (np.abs(numbers) <= limits).all()  # NaN is not
+            return bool(is_within or (absent and np.isnan(numbers).all()))
 
-        numbers = self._checked(f"timestep_{step}/{name}", is_valid, expected)
-        return np.atleast_1d(numbers)[:count]
+        return self._checked(f"timestep_{step}/{name}", is_valid, expected)
 
     def _flag(self, step: int, name: str) -> bool:
         flag = self._checked(
-            f"timestep_{step}/{name}", lambda x: x.size == 1 and x.dtype.kind in "biu", "a flag"
+            f"timestep_{step}/{name}",
+            lambda x: x.size == 1 and x.dtype.kind in "biu" and bool(0 <= x <= 1),
+            "a flag, false or true",
         )
         return bool(flag.reshape(-1)[0])
 
@@ -217,12 +235,13 @@ class RawEpisode:
         """All wordings of the goal, lower-case; the first is the one to train with."""
         with decoding(self._path("setup/task_goal"), "texts", REMEDY):
             goals = np.atleast_1d(self._value("setup/task_goal"))
-            first, *others = [_decode(goal).lower() for goal in goals]
+            texts = [_decode(goal).lower() for goal in goals]
         require(
-            first.strip(),
-            f"{self._path('setup/task_goal')} is empty, and a policy is told what to do in words.",
+            texts and all(map(is_goal, texts)),
+            f"{self._path('setup/task_goal')} is empty or holds control characters:"
+            f" {brief(texts)}. A policy is told what to do in words. {REMEDY}",
         )
-        return [first, *others]
+        return texts
 
     @property
     def seed(self) -> int | None:
@@ -271,12 +290,9 @@ class RawEpisode:
         """Joint angles and joint targets of every step, [t, 7] each, in the file's own
         precision.
         """
-        angles = []
-        targets = []
-        for k in range(self.length):
-            angles.append(self._numbers(k, "obs/joint_state", 7))
-            targets.append(self._numbers(k, "action/joint_action", 7))
-        return np.stack(angles), np.stack(targets)
+        steps = range(self.length)
+        targets = np.stack([self._numbers(k, "action/joint_action") for k in steps])
+        return np.stack([self._numbers(k, "obs/joint_state") for k in steps]), targets[:, :7]
 
     def pose_actions(self, column: str) -> np.ndarray:
         """A column of `POSE_ACTIONS`, [t, 7] float32.
@@ -286,24 +302,30 @@ class RawEpisode:
         it ends.
         """
         name = POSE_ACTIONS[column]
-        steps = np.stack([self._numbers(k, name, 7, absent=True) for k in range(self.length)])
+        is_motion = column == "waypoint_actions"
+        steps = np.stack([self._numbers(k, name, absent=is_motion) for k in range(self.length)])
+        if not is_motion:
+            for k, pose in enumerate(steps):
+                command = self._numbers(k, "action/joint_action")[-1]
+                require(
+                    pose[-1] == command,
+                    f"{self._path(f'timestep_{k}/{name}')} commands {pose[-1]} to the gripper, and"
+                    f" joint_action of the same step {command}. {REMEDY}",
+                )
+            return steps.astype(np.float32)
         is_known = np.isfinite(steps).all(1)
-        goes_on = is_known[:-1] & ~is_known[1:]
-        goes_on[self.exec_start - 1 : self.exec_start] = False  # the execution begins anew
+        is_lost = ~is_known & np.roll(is_known, 1)
+        is_lost[[0, self.exec_start]] = False  # where the video and the execution begin
         require(
-            not goes_on.any(),
-            f"{self._path(f'timestep_{goes_on.argmax() + 1}/{name}')} holds NaN after a step that"
-            f" has a pose. {REMEDY}",
+            not is_lost.any(),
+            f"{self._path(f'timestep_{is_lost.argmax()}/{name}')} holds NaN after a step that has a"
+            f" pose. {REMEDY}",
         )
-        return known_poses(
-            steps,
-            self.exec_start,
-            lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7),
-        )
+        return known_poses(steps, self.exec_start, lambda k: self._numbers(k, "action/eef_action"))
 
     def tool_poses(self) -> np.ndarray:
         """Where the tool was at every step: position and roll, pitch, yaw, [t, 6] float32."""
-        steps = [self._numbers(k, f"obs/{POSE_STATE}", POSE_WIDTH) for k in range(self.length)]
+        steps = [self._numbers(k, f"obs/{POSE_STATE}") for k in range(self.length)]
         return np.stack(steps).astype(np.float32)
 
     def choice_actions(self) -> np.ndarray:
@@ -368,7 +390,7 @@ class RawEpisode:
 
     def commanded_open(self, step: int) -> bool:
         """Whether the gripper's command at a step is to be open."""
-        return bool(self._numbers(step, "action/joint_action", 8)[7] > 0)
+        return bool(self._numbers(step, "action/joint_action")[7] > 0)
 
     def front(self, step: int) -> np.ndarray:
         return self._image(step, "front")
@@ -383,8 +405,8 @@ class RawEpisode:
             )
             latest[camera] = self._image(int(rendered.argmax()), camera)
         for k, subgoals in enumerate(self.subgoals()):
-            joints = self._numbers(k, "obs/joint_state", 7)
-            fingers = self._numbers(k, "obs/gripper_state", 1)
+            joints = self._numbers(k, "obs/joint_state")
+            fingers = self._numbers(k, "obs/gripper_state")[:1]
             now = frozenset(camera for camera, rendered in self.rendered.items() if rendered[k])
             for camera in now:
                 latest[camera] = self._image(k, camera)
@@ -392,7 +414,7 @@ class RawEpisode:
                 **latest,
                 rendered=now,
                 state=np.concatenate([joints, fingers]).astype(np.float32),
-                action=self._numbers(k, "action/joint_action", 8),
+                action=self._numbers(k, "action/joint_action"),
                 is_demo=k < self.exec_start,
                 subgoals=subgoals,
             )

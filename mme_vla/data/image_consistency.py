@@ -4,7 +4,7 @@ import io
 import logging
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,23 +109,6 @@ def _compare_size(dataset: Description, column: str, width: int, height: int) ->
         )
 
 
-@dataclass(frozen=True)
-class _Header:
-    """What a video file says of itself: pictures (0: unknown), seconds, pictures per second (0:
-    they vary), format.
-
-    begin: of the first picture, seconds.
-    """
-
-    images: int
-    begin: float
-    seconds: float
-    rate: float
-    pixel_format: str
-    width: int
-    height: int
-
-
 def check_videos(dataset: Description, column: str) -> None:
     """Compare the spans of episodes in video files with each other, with their lengths, and with
     the files.
@@ -162,80 +145,55 @@ def check_videos(dataset: Description, column: str) -> None:
                 f" {begins[k + 1]:.4f} s (from_timestamp). One of them would show the other's"
                 f" pictures. {CORRECT}"
             )
+    check = partial(_check_file, dataset, column)
     with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-        headers = list(pool.map(_read_header, episodes_of))
-    sizes = set()
-    for (path, episodes), header in zip(episodes_of.items(), headers, strict=True):
-        if _is_deep_grey(header.pixel_format):
-            raise _depth(dataset.root, column, f"{path.name} is stored as {header.pixel_format}")
-        sizes.add((header.width, header.height))
-        begins = spans.begin[episodes]
-        if not _is_even(header, begins, dataset.lengths[episodes], dataset.fps):
-            _check_frames_of_video(dataset, column, path, episodes, begins)
+        sizes = set(pool.map(check, episodes_of, episodes_of.values()))
     for width, height in sizes:
         _compare_size(dataset, column, width, height)
 
 
-def _read_header(path: Path) -> _Header:
+def _check_file(
+    dataset: Description, column: str, path: Path, episodes: np.ndarray
+) -> tuple[int, int]:
+    """Compare a video file with the episodes in it; where its header leaves a doubt, the time of
+    every picture with the times at which rows look for theirs. Decodes nothing.
+
+    Returns:
+        The width and height of its pictures.
+    """
     import av
 
     require(
         path.is_file(), f"{path} is missing: the dataset is incomplete. Copy or download it again."
     )
-    with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        tick_seconds = float(stream.time_base or 0)
-        average, base = float(stream.average_rate or 0), float(stream.base_rate or 0)
-        is_constant = abs(average - base) <= 1e-3 * base
-        context = stream.codec_context
-        header = _Header(
-            images=stream.frames,
-            begin=(stream.start_time or 0) * tick_seconds,
-            seconds=(stream.duration or 0) * tick_seconds,
-            rate=average if is_constant else 0.0,
-            pixel_format=str(context.pix_fmt),
-            width=context.width,
-            height=context.height,
-        )
-    return header
-
-
-def _is_even(header: _Header, begins: np.ndarray, lengths: np.ndarray, fps: float) -> bool:
-    """Whether a file holds the pictures of its episodes back to back, by its header alone; else one
-    has to look.
-    """
-    before = np.cumsum(lengths) - lengths
+    begins = dataset.episodes.videos[column].begin[episodes]
+    lengths, fps = dataset.lengths[episodes], dataset.fps
+    firsts = np.cumsum(lengths) - lengths
     total = int(lengths.sum())
-    return bool(
-        header.images == total
-        and header.rate > 0
-        and abs(header.begin * fps) <= QUARTER
-        and abs(total / header.rate - total / fps) * fps <= QUARTER
-        and abs(header.seconds * fps - total) <= QUARTER
-        and (np.abs(begins * fps - before) <= QUARTER).all()
-    )
-
-
-def _check_frames_of_video(
-    dataset: Description, column: str, path: Path, inside: np.ndarray, begins: np.ndarray
-) -> None:
-    """Compare the time of every picture in a file with the times at which rows look for theirs.
-    Decodes nothing.
-    """
-    import av
-
     with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
         stream = container.streams.video[0]
+        tick = float(stream.time_base or 0)
+        rate, base = float(stream.average_rate or 0), float(stream.base_rate or 0)
+        pixel_format = str(stream.codec_context.pix_fmt)
+        size = (stream.codec_context.width, stream.codec_context.height)
+        if _is_deep_grey(pixel_format):
+            raise _depth(dataset.root, column, f"{path.name} is stored as {pixel_format}")
+        # Pictures at one rate, of its episodes back to back.
+        if (
+            stream.frames == total
+            and rate > 0
+            and abs(rate - base) <= 1e-3 * base
+            and abs((stream.start_time or 0) * tick * fps) <= QUARTER
+            and abs(total / rate - total / fps) * fps <= QUARTER
+            and abs((stream.duration or 0) * tick * fps - total) <= QUARTER
+            and (np.abs(begins * fps - firsts) <= QUARTER).all()
+        ):
+            return size
         ticks = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
         if not ticks:
             raise ValueError("it holds no picture")
-        times = np.sort(np.array(ticks, np.int64)) * float(stream.time_base or 0)
-    lengths, fps = dataset.lengths[inside], dataset.fps
-    exact = len(times) == lengths.sum()
-    before = 0
-    for episode, begin, length in zip(
-        inside.tolist(), begins.tolist(), lengths.tolist(), strict=True
-    ):
+    times = np.sort(np.array(ticks, np.int64)) * tick
+    for episode, begin, length, first in zip(episodes, begins, lengths, firsts, strict=True):
         targets = begin + np.arange(length) / fps
         after = np.clip(np.searchsorted(times, targets), 1, max(len(times) - 1, 1))
         following = np.minimum(after, len(times) - 1)
@@ -245,15 +203,15 @@ def _check_frames_of_video(
         # With a picture for every row, the n-th row's is the n-th. Otherwise only the distance
         # tells.
         wrong = away > QUARTER
-        if exact:
-            wrong = nearest != before + np.arange(length)
-        before += length
+        if len(times) == total:
+            wrong = nearest != first + np.arange(length)
         frame = first_wrong(wrong | (away > HALF + 1e-6))
         if frame is not None:
             raise UserError(
                 f"{path}: frame {frame} of episode {episode} is looked for at {targets[frame]:.4f}"
                 f" s ({column}/from_timestamp {begin:.4f} s, fps={fps:g}), but the video, with"
-                f" {len(times)} pictures to {times[-1]:.4f} s for {lengths.sum()} rows, has the"
-                f" nearest at {times[nearest[frame]]:.4f} s: it is shorter than the table beside"
-                f" it, shifted, or of another rate. {CORRECT}"
+                f" {len(times)} pictures to {times[-1]:.4f} s for {total} rows, has the nearest at"
+                f" {times[nearest[frame]]:.4f} s: it is shorter than the table beside it, shifted,"
+                f" or of another rate. {CORRECT}"
             )
+    return size

@@ -1,21 +1,21 @@
 """The `data` section of a configuration → open datasets."""
 
 import logging
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mme_vla.config.sections import PathText, read_section
-from mme_vla.data.consistency import compare_names
+from mme_vla.data.consistency import compare_names, have_other_units
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, listed, require
 
 log = logging.getLogger(__name__)
 
@@ -154,17 +154,7 @@ def open_sources(
             f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its"
             " own."
         )
-    for one, another in combinations(sources, 2):
-        has_same_lengths = np.array_equal(one.lengths, another.lengths)
-        if has_same_lengths and one.fingerprint == another.fingerprint:
-            log.warning(
-                "The sources %s and %s hold the same episodes: what is held out of one may be"
-                " trained on in the other.",
-                one.name,
-                another.name,
-            )
-    # They are trained on together. Other rates and other sizes of numbers (degrees beside radians)
-    # are a warning: both may be meant.
+    # They are trained on together. Other rates are a warning: they may be meant.
     first = sources[0]
     for second in sources[1:]:
         for kind, first_names, second_names in (
@@ -180,7 +170,6 @@ def open_sources(
                 "Trained together, one number would mean two things: bring one dataset's columns"
                 " into the other's order.",
             )
-            _compare_scales(first, second, kind)
         if first.fps != second.fps:
             log.warning(
                 "The source %s has %g frames per second, %s has %g: one step of a chunk is another"
@@ -190,34 +179,64 @@ def open_sources(
                 second.name,
                 second.fps,
             )
+    compare_episodes(sources)
     return sources
 
 
-UNITS_APART = 20
-"""How many times larger one source's numbers are than the other's where units differ: 57 from
-radians to degrees.
-"""
-
-
-def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> None:
-    first_scales, second_scales = first.scales[kind], second.scales[kind]
-    moving = (first_scales > 0) & (second_scales > 0)
-    if not moving.any():
-        return
-    ratios = np.log(first_scales[moving] / second_scales[moving])
-    median = np.median(ratios)
-    if abs(median) < np.log(UNITS_APART):
-        return
-    # the number that shows it best
-    d = int(np.flatnonzero(moving)[np.argmin(np.abs(ratios - median))])
-    log.warning(
-        "The %s of %s and of %s seem to have different units: number %d reaches %.4g in one and"
-        " %.4g in the other (degrees beside radians differ by 57). Statistics are computed over"
-        " both; convert one if that is not meant.",
-        kind,
-        first.name,
-        second.name,
-        d + 1,
-        first_scales[d],
-        second_scales[d],
-    )
+def compare_episodes(sources: Sequence[EpisodeSource]) -> None:
+    """Compare the episodes of one or several datasets with each other, and the actions of each with
+    its states. What is found is a warning, since it may be meant.
+    """
+    findings: dict[str, list[str]] = defaultdict(list)
+    places_by_digest: dict[bytes, str] = {}
+    switches: dict[int, dict[tuple[float, float], str]] = defaultdict(dict)
+    first: tuple[str, np.ndarray] | None = None
+    for source in sources:
+        relative = list(source.robot.action.relative)
+        second = max(round(source.fps), 2)
+        for episode in range(len(source)):
+            place = f"{source.name}/{episode}"
+            states, actions = source.states(episode), source.actions(episode)
+            original = places_by_digest.setdefault(
+                sha256(states.tobytes() + actions.tobytes()).digest(), place
+            )
+            if original != place:
+                findings[
+                    "Episodes hold the same states and actions, so what is held out of one may be"
+                    " trained on in the other; delete one"
+                ].append(f"{place} as {original}")
+            if relative and len(states) >= 4 * second:
+                # Errors by how many frames after an action a state is looked for, ten a second.
+                acted = actions[second : -2 * second, relative]
+                errors = {}
+                for lag in range(-second, 2 * second + 1, max(second // 10, 1)):
+                    reached = states[second + lag :, relative][: len(acted)]
+                    errors[lag] = float(np.abs(acted - reached).mean())
+                best = min(errors, key=lambda lag: errors[lag])
+                if 2 * errors[best] < min(errors[lag] for lag in errors if -1 <= lag <= second):
+                    findings[
+                        "Actions fit other states than those of the second after them, by which a"
+                        " robot follows: record both with one clock"
+                    ].append(f"{place} those {best:+} frames away")
+            numbers = np.concatenate([states, actions], axis=1)
+            low, high = numbers.min(axis=0), numbers.max(axis=0)
+            sizes = np.maximum(np.abs(low), np.abs(high))
+            first = first or (place, sizes)
+            if have_other_units(sizes, first[1]):
+                findings[
+                    f"States and actions have other units than in episode {first[0]} (degrees and"
+                    " radians differ by 57): convert one"
+                ].append(place)
+            is_switch = ((numbers == low) | (numbers == high)).all(axis=0) & (low < high)
+            for d in np.flatnonzero(is_switch & (low % 1 == 0) & (high % 1 == 0)).tolist():
+                switches[d].setdefault((low[d].item(), high[d].item()), place)
+    for d, places in switches.items():
+        if len(places) > 1:
+            width = sources[0].robot.state.width
+            name = f"{d + 1} of the state" if d < width else f"{d - width + 1} of the action"
+            pairs = [f"{low:g} or {high:g} in {place}" for (low, high), place in places.items()]
+            findings["One command means two things: bring it to one scale"].append(
+                f"number {name} is {' and '.join(pairs)}"
+            )
+    for problem, where in findings.items():
+        log.warning("%s: %s.", problem, listed(where))

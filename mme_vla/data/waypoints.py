@@ -88,7 +88,7 @@ def known_poses(
 
 
 CHOICE_ACTIONS = "choice_actions"
-CHOICE_NUMBERS = [*(f"choice_{letter}" for letter in LETTERS), "point_y", "point_x"]
+CHOICE_NUMBERS = [*LETTERS, "y", "x"]
 """A row of the column: at the frame where what was chosen began; all zeros at every other."""
 
 

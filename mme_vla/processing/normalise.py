@@ -86,7 +86,9 @@ class QuantileStats:
         for low, high in (("q01", "q99"), ("min", "max")):
             if high in arrays and low in arrays and (arrays[low] > arrays[high]).any():
                 raise UserError(
-                    f"{name}: {high} lies below {low} in a dimension; the statistics are damaged."
+                    f"{name}: {high} lies below {low} for number"
+                    f" {listed(np.flatnonzero(arrays[low] > arrays[high]) + 1)} of"
+                    f" {len(arrays[low])}; the statistics are damaged."
                 )
         return cls(**arrays)
 

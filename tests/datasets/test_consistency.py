@@ -153,11 +153,18 @@ def test_a_table_of_tasks_that_numbers_them_otherwise_than_by_row_is_refused(
         opened(tmp_path)
 
 
-@pytest.mark.parametrize("task", ["", "  \n"])
-def test_an_empty_goal_is_refused(tmp_path: Path, task: str) -> None:
+@pytest.mark.parametrize("task", ["", "  \n", "\u200b", "pick\0up", "open \x1b[31mit"])
+def test_a_goal_without_words_or_with_control_characters_is_refused(
+    tmp_path: Path, task: str
+) -> None:
     write_dataset(tmp_path, tasks=(TASKS[0], task))
-    with pytest.raises(UserError, match=r"the task '.*' is empty"):
+    with pytest.raises(UserError, match=r"the task '.*' is empty or holds control characters"):
         opened(tmp_path)
+
+
+@pytest.mark.parametrize("task", ["lift it\r\nslowly", "در را ب\u200cاز کن", "打开抽屉"])
+def test_goals_of_several_lines_and_of_any_language_are_read(tmp_path: Path, task: str) -> None:
+    assert opened(write_dataset(tmp_path, tasks=(TASKS[0], task))).goal(1) == task
 
 
 def test_the_fingerprint_follows_the_table_of_tasks_where_goals_come_from_it(
@@ -195,9 +202,9 @@ def test_the_fingerprint_follows_the_table_of_tasks_where_goals_come_from_it(
         (
             "index",
             [0, 1, 2, 3, 4, 0, 1, 2, 3],
-            r"row 5, frame 0 of episode 1, has index 0; expected 5",
+            r"row 5, frame 0 of episode 1, has index 0; by its place it is 5",
         ),
-        ("index", list(range(8, -1, -1)), r"has index 8; expected 0"),
+        ("index", list(range(8, -1, -1)), r"has index 8; by its place it is 0"),
         ("timestamp", [i / 9 for i in [*range(5), *range(4)]], "none"),  # within half a frame
         (
             "timestamp",
@@ -396,11 +403,11 @@ def test_numbers_in_a_column_of_flags_are_not_taken_for_one(tmp_path: Path) -> N
 def test_two_sources_of_one_content_are_a_warning(tmp_path: Path, caplog) -> None:
     write_dataset(tmp_path / "one")
     shutil.copytree(tmp_path / "one", tmp_path / "two")
-    write_dataset(tmp_path / "three", tasks=TASKS[::-1])
+    write_dataset(tmp_path / "three", states=np.random.default_rng(3).normal(size=(9, 3)))
     open_sources([str(tmp_path / "one"), str(tmp_path / "three")], custom_robot())
     assert not caplog.text
     open_sources([str(tmp_path / name) for name in ("one", "two")], custom_robot())
-    assert "The sources one and two hold the same episodes" in caplog.text
+    assert "what is held out of one" in caplog.text and "two/0 as one/0, two/1 as" in caplog.text
 
 
 # Videos
@@ -570,7 +577,9 @@ def test_the_same_names_in_another_order_are_refused_and_other_names_named(
 ) -> None:
     names = ["shoulder", "elbow", "gripper"]
     roots = [
-        write_dataset(tmp_path / str(i), names=other, tasks=(f"take {i}", "put it back"))
+        write_dataset(
+            tmp_path / str(i), names=other, states=np.random.default_rng(i).random((9, 3))
+        )
         for i, other in enumerate(
             (names, ["elbow", "shoulder", "gripper"], {"motors": names}, ["hip", "knee", "toe"])
         )
@@ -621,7 +630,8 @@ def test_sources_of_other_rates_and_other_units_are_noticed(tmp_path: Path, capl
     assert not caplog.text
     open_sources([str(first), str(second)], custom_robot())
     assert "first has 10 frames per second, second has 30" in caplog.text
-    assert "The state of first and of second seem to have different units" in caplog.text
+    assert "have other units than in episode first/0" in caplog.text
+    assert "second/0, second/1" in caplog.text
 
 
 def test_numbers_too_large_for_the_robots_unit_are_noticed(tmp_path: Path, caplog) -> None:
@@ -702,7 +712,7 @@ def test_rows_without_the_number_of_their_episode_are_refused(tmp_path: Path) ->
 
 def test_rows_of_other_episodes_than_described_are_named(tmp_path: Path) -> None:
     change(write_dataset(tmp_path), ROWS, "episode_index", [0, 0, 0, 0, 1, 1, 1, 1, 1])
-    with pytest.raises(UserError, match=r"row 4 has episode_index 1; by .* of episode 0"):
+    with pytest.raises(UserError, match=r"row 4, .* has episode_index 1; by its place it is 0"):
         opened(tmp_path)
 
 

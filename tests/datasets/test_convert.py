@@ -151,3 +151,14 @@ def test_a_finished_conversion_is_recognised_and_nothing_foreign_is_overwritten(
     (partial / "plan.json").write_text(json.dumps({"options": {}, "episodes": []}))
     with pytest.raises(UserError, match="belongs to another conversion"):
         convert(refs, tmp_path / "new", PNG)
+
+
+def test_an_episode_that_no_file_has_is_named(recorded, tmp_path: Path) -> None:
+    from omegaconf import OmegaConf
+
+    from mme_vla.cli.convert import main
+
+    refs, _ = recorded
+    words = {"input": str(refs[0].file.parent), "output": str(tmp_path / "out"), "episodes": [1, 7]}
+    with pytest.raises(UserError, match="episodes names 7, which none of the files has; they have"):
+        main(OmegaConf.create(words))

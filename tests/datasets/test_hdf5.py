@@ -95,7 +95,7 @@ def choice(letter: str, *point: int) -> Callable[[h5py.Group], None]:
     return replaced("timestep_4/action/choice_action", text)
 
 
-NAN, FAR = np.array([np.nan, *range(6)]), np.array([1e39, *range(7)])
+NAN, FAR = np.array([np.nan, *range(6)]), np.array([1e39, *[0.5] * 7])
 WAYPOINT = "timestep_8/action/waypoint_action"
 
 
@@ -105,7 +105,33 @@ WAYPOINT = "timestep_8/action/waypoint_action"
         (replaced("setup/task_goal", np.array([0.0])), "setup/task_goal is damaged.*a text is exp"),
         (replaced("setup/task_goal", ""), "setup/task_goal is empty"),
         (replaced("setup/difficulty", 3), "setup/difficulty is damaged.*a text is expected"),
-        (replaced("timestep_5/action/joint_action", FAR), "timestep_5/.* within float32"),
+        (replaced("setup/task_goal", ["lift it", "a\x1b[31m"]), "setup/task_goal .* control char"),
+        (replaced("timestep_5/action/joint_action", FAR), "timestep_5/.* of sizes up to"),
+        (
+            replaced("timestep_5/action/joint_action", np.zeros(9)),
+            "timestep_5/.*; expected 8",
+        ),
+        (replaced("timestep_5/action/joint_action", np.full(8, 2.0)), "command from −1 to 1"),
+        (replaced("timestep_5/obs/joint_state", np.full(7, 90.0)), "timestep_5/.*radians"),
+        (replaced("timestep_5/obs/joint_state", np.full(7, 1)), "timestep_5/.*floating-point"),
+        (replaced("timestep_5/obs/gripper_state", np.full(2, 40.0)), "timestep_5/.*metres"),
+        (replaced("timestep_5/obs/eef_state", np.zeros(7)), "timestep_5/.*; expected 6 floating"),
+        (
+            replaced("timestep_0/action/waypoint_action", np.full(8, np.nan)),
+            "; expected 7",
+        ),
+        (
+            replaced("timestep_0/action/eef_action", np.full(7, np.nan)),
+            "timestep_0/.*eef_action",
+        ),
+        (
+            replaced("timestep_5/action/eef_action", np.full(7, 0.0)),
+            "timestep_5/action/eef_action commands 0.0 to the gripper, and joint_action .* 1.0",
+        ),
+        (
+            replaced("timestep_5/info/is_completed", 7),
+            "timestep_5/.*a flag, false or true",
+        ),
         (replaced(WAYPOINT, NAN), "timestep_8/action/waypoint_action .*or NaN alone"),
         (replaced(WAYPOINT, np.full(7, np.inf)), "timestep_8/action/waypoint_action .*inf"),
         (replaced(WAYPOINT, np.full(7, np.nan)), "timestep_8/.* NaN after a step that has a pose"),
@@ -127,6 +153,23 @@ def test_values_that_cannot_be_are_named_before_they_are_converted(
         damage(file["episode_0"])
     with pytest.raises(UserError, match=message):
         convert(list_episodes([path]), tmp_path / "data", ConvertOptions(images="png"))
+
+
+@pytest.mark.parametrize("camera", ["front", "wrist"])
+def test_a_camera_that_shows_one_image_all_the_time_is_named(tmp_path: Path, camera: str) -> None:
+    path = tmp_path / "record_dataset_Alpha.h5"
+    write_file(path, [6])
+    with h5py.File(path, "r+") as file:
+        for t in range(6):
+            file[f"episode_0/timestep_{t}/obs/{camera}_rgb"][:] = 0
+    with pytest.raises(UserError, match=rf"episode_0: {camera} has the same image at all 6 steps"):
+        convert(list_episodes([path]), tmp_path / "data", ConvertOptions(images="png"))
+
+
+def test_an_episode_of_one_step_is_converted(tmp_path: Path) -> None:
+    path = tmp_path / "record_dataset_Alpha.h5"
+    write_file(path, [1], poses=True)
+    assert convert(list_episodes([path]), tmp_path / "data", ConvertOptions(images="png")) == 1
 
 
 def test_an_image_that_was_not_rendered_is_named_whatever_the_choice_of_frames_says(

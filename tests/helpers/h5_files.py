@@ -89,6 +89,7 @@ def write_file(
             for t in range(length):
                 frames[:, t, t % size, :4] = 255
             joints, actions = rng.normal(size=(length, 7)), rng.normal(size=(length, 8))
+            actions[:, 7] = [pose_at(t)[6] for t in range(length)]
             for t in range(length):
                 step = episode.create_group(f"timestep_{t}")
                 step["obs/front_rgb"], step["obs/wrist_rgb"] = frames[0, t], frames[1, t]

@@ -148,7 +148,7 @@ def test_statistics_survive_their_file(tmp_path: Path) -> None:
                 '{"norm_stats": {"state": {"mean": [0], "std": [1], "q01": [2], "q99": [1]},'
                 ' "actions": {}}}'
             ),
-            "below q01",
+            "state: q99 lies below q01 for number 1 of 1",
         ),
         (
             (

@@ -24,6 +24,7 @@ class Recording(recording.Recording):
         if not robot.readings:
             return super().views(start, stop, required)
         keyframes = EpisodeKeyframes(KeyframeFile.file_of(self.source.root, self.episode))
+        keyframes.check(self.length)
         here = keyframes.frames[(keyframes.frames >= start) & (keyframes.frames < stop)]
         stored_views = keyframes.views(here, robot)
         return stored_views, dict.fromkeys(stored_views, here - start)

@@ -132,6 +132,27 @@ class EpisodeKeyframes:
                 f"{self.path} is damaged ({error}): convert the recordings again."
             ) from None
 
+    def check(self, length: int) -> None:
+        """Refuse keyframes that are not those of an episode of `length` frames."""
+        arrays = self._read("frames", "decisions", "targets", "open", "length")
+        decisions, targets = arrays["decisions"], arrays["targets"]
+        expected = np.union1d(np.arange(0, length, ENTRY_EVERY), decisions)
+        fits = (
+            arrays["length"] == length
+            and np.array_equal(arrays["frames"], expected)
+            and expected[-1] < length
+            and len(arrays["open"]) == len(expected)
+            and len(targets) == len(decisions)
+            and np.isfinite(targets).all()
+        )
+        if not fits:
+            raise UserError(
+                f"{self.path} holds {len(arrays['frames'])} keyframes of an episode of"
+                f" {arrays['length']} frames, with {len(decisions)} motions; expected those of the"
+                f" dataset's episode of {length} frames. Convert the recordings again with"
+                " keyframes=true."
+            )
+
     @cached_property
     def motions(self) -> Motions:
         arrays = self._read("decisions", "targets")
@@ -265,6 +286,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
                 source.goal(episode)
                 self.total_frames += int(source.lengths[episode])
                 keyframes = EpisodeKeyframes(KeyframeFile.file_of(source.root, episode))
+                keyframes.check(int(source.lengths[episode]))
                 chains = [chain for chain in keyframes.chains if len(chain) >= length]
                 longest = max(longest, *map(len, keyframes.chains))
                 runs = chains

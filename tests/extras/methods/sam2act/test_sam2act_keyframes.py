@@ -1,5 +1,6 @@
 """Keyframes with depth beside a dataset, the chains they form, and the clouds they become."""
 
+import shutil
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -128,6 +129,22 @@ def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> 
     assert item["sample"].targets.shape == (1, 7)
 
 
+@pytest.mark.parametrize("damage", ["another episode's", "frames", "decisions", "targets"])
+def test_keyframes_of_another_episode_than_the_tables_hold_are_refused(
+    folder: Path, tmp_path: Path, damage: str
+) -> None:
+    shutil.copytree(folder / "out", tmp_path / "out")
+    path = KeyframeFile.file_of(tmp_path / "out", 0)
+    if damage == "another episode's":
+        shutil.copy(KeyframeFile.file_of(tmp_path / "out", 1), path)
+    else:
+        arrays = dict(np.load(path))
+        arrays[damage] = arrays[damage] + (np.nan if damage == "targets" else 1)
+        np.savez(path, **arrays)
+    with pytest.raises(UserError, match=rf"episode_000000.npz .* of {LENGTHS[0]} frames"):
+        KeyframeDataset([source_of(tmp_path)], Identity(), 1)
+
+
 def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(folder: Path) -> None:
     data, again = (
         KeyframeDataset([source_of(folder)], Identity(), 3, seed=5, sampled=False) for _ in range(2)
@@ -177,7 +194,7 @@ def sampled_shares(
         chains = [
             [Link(place, place, place) for place in range(count)] for count in source.chains[number]
         ]
-        return SimpleNamespace(chains=chains)
+        return SimpleNamespace(check=lambda length: None, chains=chains)
 
     monkeypatch.setattr(keyframes, "EpisodeKeyframes", keep)
     data = KeyframeDataset([source], Identity(), length)
