@@ -168,8 +168,7 @@ class EpisodeSource:
                 least, greatest = check_vectors(self.root, self._table, column, width)
                 compare_stats(self.root, column, least, greatest)
                 sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
-            if sizes:
-                scales[kind] = np.concatenate(sizes)
+            scales[kind] = np.concatenate([np.zeros(0), *sizes])
         action = self.robot.action
         compare_units(self.root, action.names, action.units, scales["action"])
         places = list(action.relative)
