@@ -178,8 +178,12 @@ class CommandParser(argparse.ArgumentParser):
     where more is said.
     """
 
+    _chosen: argparse.ArgumentParser | None = None  # the parser of the subcommand
+
     def error(self, message: str) -> NoReturn:
         """End with a mistake of a command line."""
+        if self._chosen is not None and message.startswith("unrecognized"):
+            self._chosen.error(message)  # whose words these are
         with print_user_errors():
             sentence = self._explanation(message).rstrip(".")
             raise UserError(f"{sentence}. `{self.prog} --help` says more.")
@@ -187,6 +191,8 @@ class CommandParser(argparse.ArgumentParser):
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is None or value in action.choices:
+            if isinstance(action, argparse._SubParsersAction):
+                self._chosen = action.choices[value]
             return
         name = "/".join(action.option_strings) or str(action.metavar or action.dest)
         choices = [str(choice) for choice in action.choices]
@@ -221,18 +227,12 @@ class CommandParser(argparse.ArgumentParser):
         return f"{message[:1].upper()}{message[1:]}."
 
     def _unknown_word(self, word: str) -> str:
-        parsers: list[argparse.ArgumentParser] = [self]
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                parsers += action.choices.values()
-        options = []
-        for parser in parsers:
-            options += [name for name in parser._option_string_actions if name.startswith("--")]
+        options = [name for name in self._option_string_actions if name.startswith("--")]
         typed = word.partition("=")[0]
         if not word.startswith("-") and f"--{typed}" in options:
             return f"{word!r} is written as an option here: {_as_option(word)}."
         what = "There is no option" if word.startswith("-") else "There is no place for the word"
-        return f"{what} {typed!r}. {did_you_mean(typed, set(options))}"
+        return f"{what} {typed!r}. {did_you_mean(typed, options)}"
 
     def _help_of(self, name: str) -> str:
         """What help says of a positional argument."""

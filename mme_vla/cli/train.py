@@ -24,7 +24,7 @@ from mme_vla.policy.finetune import (
     copy_tower,
     warn_of_frozen_random_weights,
 )
-from mme_vla.policy.run_folders import training_name
+from mme_vla.policy.run_folders import find_run, training_name
 from mme_vla.policy.tensor_files import take_memory
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import identify
@@ -89,7 +89,8 @@ def train_several(run: TrainRun, folder: Path, named: bool = True) -> list[Path]
     if run.resume == "auto" and not named:
         folder = unfinished_trainings(folder, run.trainings)
     elif run.resume not in (None, "auto"):
-        folder = Path(run.resume)
+        folder = find_run(Path(run.resume))
+        require(folder.is_dir(), f"resume={run.resume}: there is no such folder of trainings.")
     check_kind(folder, several=True)
     checkpoints = []
     for number in range(run.trainings):

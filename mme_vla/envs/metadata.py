@@ -286,12 +286,6 @@ def check_split(split: str) -> Variant | None:
     return read_variant(split)
 
 
-def is_other(split: str) -> bool:
-    """Whether a split has other episodes than those that the paper's figures are about."""
-    base = base_of(split)
-    return base in FURTHER_SPLITS or base in (HARD, CHALLENGE, RESERVED) or is_row_split(base)
-
-
 def all_tasks() -> tuple[str, ...]:
     """The benchmark's tasks and the user's own."""
     return (*TASK_NAMES, *(task for task in TASKS if task not in TASK_NAMES))

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
+from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.errors import counted
 from mme_vla.evaluation.records import EpisodeRecord
 
@@ -66,7 +67,8 @@ def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]
     """Pair the episodes that all sides have and whose scenes are the same in all their records.
 
     Scenes are the same where all records have equal digests, or where none has one; and where their
-    seeds are equal.
+    seeds are equal. An episode that ended before its scene was built goes with any scene of its
+    seed.
 
     Args:
         sides: of each run, its records by what makes an episode the same, such as task and number.
@@ -81,7 +83,7 @@ def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]
         records: list[EpisodeRecord] = []
         for side in sides:
             records += side[key]
-        scenes = {record.named_scene for record in records}
+        scenes = {record.named_scene for record in records if record.scene != NOT_BUILT}
         seeds = {record.seed for record in records}
         if len(scenes - {None}) > 1 or len(seeds) > 1:
             other[records[0].task] += 1
@@ -89,7 +91,7 @@ def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]
             mixed[records[0].task] += 1
         else:
             keys.append(key)
-            if scenes == {None}:
+            if scenes <= {None}:
                 unnamed += 1
     return Pairing(tuple(keys), unnamed, dict(other), dict(mixed))
 

@@ -41,13 +41,14 @@ class ChangeScorer(FrameScorer):
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Score one frame [H, W, 3] uint8, or keep it as a reference."""
-        if not on_interval(frame_index, self.stride):
-            return None
+        # The first frame is refused already, scored or not: an episode has images of one size.
         height, width, _ = frame.shape
         if height % self.grid or width % self.grid:
             raise UserError(
                 f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches."
             )
+        if not on_interval(frame_index, self.stride):
+            return None
         image = frame.astype(np.float32) / 255 * 2 - 1
         reference = self._reference
         self._reference = image
@@ -61,7 +62,7 @@ class ChangeScorer(FrameScorer):
 
 # The digest of `ChangeScorer` as it stands, and the key of caches from before keys had digests.
 # Another scorer has a key of its own, and its caches are built anew.
-FORMER_KEYS["5f47a9f0"] = "change{grid}x{grid}-every{stride}"
+FORMER_KEYS["73ce2c9e"] = "change{grid}x{grid}-every{stride}"
 
 
 @MEMORIES.register("tokendrop")

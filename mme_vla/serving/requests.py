@@ -324,10 +324,12 @@ class RequestReader:
         observed: dict[str, Any] = {"state": (_shaped(width), Field(alias="observation/state"))}
         listed: dict[str, Any] = {}
         for camera in robot.cameras:
-            keys = [f"observation/{camera.name}"]
-            if camera.name in self._released:
-                keys.append(self._released[camera.name])
-            observed[f"see_{camera.name}"] = (Image, Field(validation_alias=AliasChoices(*keys)))
+            own = f"observation/{camera.name}"
+            # An error names the first of the two, which released clients send.
+            keys = AliasChoices(self._released.get(camera.name, own), own)
+            meaning = f"an image of the camera {camera.name!r}"
+            field = Field(validation_alias=keys, description=meaning)
+            observed[f"see_{camera.name}"] = (Image, field)
             listed[f"see_{camera.name}"] = (one_size, Field(alias=f"{camera.name}_rgb_list"))
             if camera.depth:
                 depth_name, pose_name = camera.readings

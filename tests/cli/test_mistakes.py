@@ -51,6 +51,8 @@ def reply(
         ("results x --epsiodes 3", "There is no option '--epsiodes'. Did you mean '--episodes'?"),
         ("results x --errors fail", "--errors 'fail' is not known. Did you mean 'failure'?"),
         ("results verify", "A value is needed for receipt (receipt: receipt.json, or a folder"),
+        ("analyse cost --chekpoint x", "There is no option '--chekpoint'. Known: --backbone"),
+        ("analyse cost --chekpoint x", "`mme-vla analyse cost --help` says more."),
         ("docs --biuld", "There is no option '--biuld'. Did you mean '--build'?"),
         ("docs --output", "--output needs one value."),
         ("evaluate with=[drop:all]", "Unknown config key 'with'. Known: backbone,"),

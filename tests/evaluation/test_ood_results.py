@@ -3,6 +3,7 @@ training range.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -137,13 +138,17 @@ def test_a_scene_of_two_splits_counts_once() -> None:
 
 
 def test_the_papers_figures_do_not_stand_beside_other_episodes() -> None:
-    for split in ("ood", "hard", "challenge", "twin:ood"):
+    for split in ("ood", "hard", "challenge", "twin:ood", "twin", "stress:count=2", "val", "train"):
         results = aggregate(
             made("StopCube", split, [1] * 12, model="framesamp_modul"), Protocol(("StopCube",), 12)
         )
         assert results.methods[0].paper is None
         (note,) = [note for note in results.notes if "none of the benchmark's" in note]
-        assert ("beyond the benchmark's own" in note) == (split != "hard")
+        assert ("hard episodes alone" in note) == (split == "hard")
+    elsewhere = [replace(r, env="mine") for r in made("StopCube", "test", [1], "framesamp_modul")]
+    alone = Protocol(("StopCube",), 1)
+    assert aggregate(elsewhere, alone).methods[0].paper is None
+    assert aggregate([replace(r, env=None) for r in elsewhere], alone).methods[0].paper
 
 
 def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -58,7 +58,7 @@ def sides(*scenes: Sequence[str | None]) -> list[dict[EpisodeKey, list[EpisodeRe
         ([None] * 4, [None] * 4, 4, 4, 0, 0),
         (HERE, [None] * 4, 0, 0, 0, 4),
         ([None, NO_VALUES, NOT_BUILT, "a"], [NO_VALUES, None, NOT_BUILT, "a"], 4, 3, 0, 0),
-        (["a", NO_VALUES, NOT_BUILT, "d"], ["a", "b", "c", "e"], 1, 0, 1, 2),
+        (["a", NO_VALUES, NOT_BUILT, "d"], ["a", "b", "c", "e"], 2, 0, 1, 1),
     ],
     ids=str,
 )
@@ -80,6 +80,15 @@ def test_equal_digests_are_paired_or_none_on_both_sides(
     assert counts == (paired, unnamed, other, mixed)
     turned = pair(sides(second, first))
     assert (turned.keys, turned.other, turned.mixed) == (pairing.keys, pairing.other, pairing.mixed)
+
+
+def test_an_episode_that_ended_before_its_scene_was_built_counts_in_comparisons() -> None:
+    broken = named(records("test", [0] * 4, "m"), [NOT_BUILT] * 4)
+    broken = [replace(record, outcome="error") for record in broken]
+    every = [*broken, *named(records("test", [1] * 4, "n"), HERE)]
+    first, second = aggregate(every, PROTOCOL).methods
+    result = compare(first, second, PROTOCOL)
+    assert (result.episodes, result.losses, result.notes) == (4, 4, ())
 
 
 def test_other_seeds_are_other_scenes_without_a_digest_too() -> None:

@@ -64,6 +64,8 @@ def test_an_image_that_does_not_divide_says_what_would_fit(
     for scorer in (ChangeScorer(8, 4), _Upsampled(ChangeScorer(8, 4), 8, 16)):
         with pytest.raises(UserError, match=f"multiples of 8, set memory.grid={grid}, or"):
             score_frame(scorer, 3, image)
+        with pytest.raises(UserError, match="multiples of 8"):
+            score_frame(scorer, 0, image)  # and not when the first frame that counts comes
     score_frame(ChangeScorer(grid, 4), 3, image)
 
 

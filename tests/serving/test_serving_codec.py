@@ -322,6 +322,8 @@ def test_a_camera_has_the_key_of_its_name_and_the_released_one(key):
     assert parse({**sent, key: WHITE}).views["front"].min() == 255
     with pytest.raises(UserError, match=f"{key} must be a uint8 image"):
         parse({**sent, key: WHITE.astype(np.float32)})
+    with pytest.raises(UserError, match=r"lacks the key 'observation/image' \(an image of .*front"):
+        parse(sent)
     both = {"observation/front": WHITE, "observation/image": WHITE}
     with pytest.raises(UserError, match="both images of the camera 'front': send one"):
         parse({**sent, **both})

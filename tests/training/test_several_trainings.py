@@ -15,7 +15,7 @@ from mme_vla.config.composition import compose
 from mme_vla.evaluation.rollout.evaluation import facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.run_folders import find_run, locate_checkpoint, trainings_in
-from mme_vla.training.runs import check_finished
+from mme_vla.training.runs import Run, check_finished
 
 SMALL = [
     "model=framesamp_modul",
@@ -105,3 +105,19 @@ def test_a_folder_holds_a_single_run_or_several_trainings(tmp_path: Path) -> Non
         words = [*SMALL, "trainings=1", f"output={tmp_path / 'two'}", f"resume={resume}"]
         with pytest.raises(UserError, match="two holds trainings of one recipe: add trainings"):
             command.main(compose("train", words))
+
+
+def test_several_trainings_continue_with_the_latest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = tmp_path / "model" / "two"
+    state = group / "training_0" / "checkpoints" / "step_000001" / "training_state.json"
+    state.parent.mkdir(parents=True)
+    state.touch()
+    places = []
+    monkeypatch.setattr(command, "open_run", lambda place, *_, **__: Run(place))
+    monkeypatch.setattr(command, "train", lambda run, place, *_, **__: places.append(place))
+    command.main(compose("train", [*SMALL, f"resume={tmp_path}/model/latest"]))
+    assert places == [group / "training_0", group / "training_1"]
+    with pytest.raises(UserError, match="lost: there is no such folder"):
+        command.main(compose("train", [*SMALL, f"resume={tmp_path}/model/lost"]))

@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 
 from mme_vla.config.naming import DEFAULT_BUDGET
-from mme_vla.envs.metadata import BASE, HARD, base_of, is_other
+from mme_vla.envs.make import ROBOMME
+from mme_vla.envs.metadata import BASE, HARD, base_of
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, counted, did_you_mean, require
 from mme_vla.evaluation.pairing import pair
@@ -417,10 +418,10 @@ def _method(key: RunKey, table: pd.DataFrame, protocol: Protocol) -> Method:
         )
     )
     known = None
-    other_scenes = any(is_other(run.key.split) for run in runs)
+    of_paper = all(r.split == BASE and r.env in (None, ROBOMME) for r in table["record"])
     of_benchmark = any(record.task in TASK_FACTS for record in table["record"])
     is_standard = key.event is None and key.memory_budget in (None, DEFAULT_BUDGET)
-    if is_standard and of_benchmark and not other_scenes:
+    if is_standard and of_benchmark and of_paper:
         known = paper.paper_method(key.model, key.subgoal)
     method = Method(key.label, key, runs, table, known)
     # Every episode that a run is to have, in order; NaN where it lacks it.
@@ -562,15 +563,14 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
                     " name them; its mean is over all of them."
                 )
     notes += limit_notes(record for method in methods for record in method.table["record"])
-    splits: set[str] = set()
+    splits = set()
     for method in methods:
-        splits.update(run.key.split for run in method.runs)
-    for split in sorted(splits):
-        if is_other(split):
-            what = "scenes beyond the benchmark's own"
-            if split == HARD:
-                what = f"the {BASE} split's hard episodes alone"
-            notes.append(f"Split {split!r}: {what}; figures of it are none of the benchmark's.")
+        splits |= {record.split for record in method.table["record"] if record.task in TASK_FACTS}
+    for split in sorted(splits - {BASE}):
+        what = f"other episodes than those of the {BASE} split"
+        if split == HARD:
+            what = f"the {BASE} split's hard episodes alone"
+        notes.append(f"Split {split!r}: {what}; figures of it are none of the benchmark's.")
     if outside:
         notes.append(
             f"Left out: {counted(outside, 'record')} of other tasks, or of other episodes."
