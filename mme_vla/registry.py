@@ -152,7 +152,8 @@ def installed_extensions() -> tuple[Extension, ...]:
     """
     listed: list[Extension] = []
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
-        plugin = f"installed plugin {entry.name!r} ({entry.value})"
+        package = getattr(entry.dist, "name", "?")
+        plugin = f"installed plugin {entry.name!r} of the package {package!r} ({entry.value})"
         try:
             extension = entry.load()
         except Exception as error:  # any error of a third-party package

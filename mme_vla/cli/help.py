@@ -178,12 +178,12 @@ class CommandParser(argparse.ArgumentParser):
     where more is said.
     """
 
-    _chosen: argparse.ArgumentParser | None = None  # the parser of the subcommand
+    _subparser: argparse.ArgumentParser | None = None  # the parser of the subcommand
 
     def error(self, message: str) -> NoReturn:
         """End with a mistake of a command line."""
-        if self._chosen is not None and message.startswith("unrecognized"):
-            self._chosen.error(message)  # whose words these are
+        if self._subparser is not None and message.startswith("unrecognized"):
+            self._subparser.error(message)  # whose words these are
         with print_user_errors():
             sentence = self._explanation(message).rstrip(".")
             raise UserError(f"{sentence}. `{self.prog} --help` says more.")
@@ -192,7 +192,7 @@ class CommandParser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is None or value in action.choices:
             if isinstance(action, argparse._SubParsersAction):
-                self._chosen = action.choices[value]
+                self._subparser = action.choices[value]
             return
         name = "/".join(action.option_strings) or str(action.metavar or action.dest)
         choices = [str(choice) for choice in action.choices]

@@ -116,7 +116,7 @@ class ConfigTree:
 
     def check_kinds(self) -> None:
         """Refuse a value of another kind than the default: text for a number, a value for a
-        section.
+        section, or the name of a file for the class of another one's options.
         """
         defaults = self.defaults if self.values else {}
         for override in self.values:
@@ -127,6 +127,14 @@ class ConfigTree:
                 raise UserError(
                     f"{override.input_line!r} does not fit: {override.key_or_group!r} is"
                     f" {expected}."
+                )
+            group, _, key = override.key_or_group.rpartition(".")
+            is_part = group != "" and key == "name"
+            has_file = is_part and value in self.loader.get_group_options(group)
+            if has_file and value != default:
+                raise UserError(
+                    f"{override.input_line!r} would keep the options of {default}. Write"
+                    f" {group}={value}, which brings its own."
                 )
 
 

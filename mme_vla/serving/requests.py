@@ -324,9 +324,9 @@ class RequestReader:
         observed: dict[str, Any] = {"state": (_shaped(width), Field(alias="observation/state"))}
         listed: dict[str, Any] = {}
         for camera in robot.cameras:
-            own = f"observation/{camera.name}"
+            key = f"observation/{camera.name}"
             # An error names the first of the two, which released clients send.
-            keys = AliasChoices(self._released.get(camera.name, own), own)
+            keys = AliasChoices(self._released.get(camera.name, key), key)
             meaning = f"an image of the camera {camera.name!r}"
             field = Field(validation_alias=keys, description=meaning)
             observed[f"see_{camera.name}"] = (Image, field)

@@ -55,6 +55,7 @@ def reply(
         ("analyse cost --chekpoint x", "`mme-vla analyse cost --help` says more."),
         ("docs --biuld", "There is no option '--biuld'. Did you mean '--build'?"),
         ("docs --output", "--output needs one value."),
+        ("evaluate checkpoint=nano plugins=[json] max_steps=0", "max_steps=0 must be a whole"),
         ("evaluate with=[drop:all]", "Unknown config key 'with'. Known: backbone,"),
         ("evaluate checkpoint=missing", "No checkpoint at missing: there is no such folder."),
         ("evaluate checkpoint=outputs/missing", "No checkpoint at outputs/missing: there is no"),

@@ -166,9 +166,9 @@ def test_other_words_of_a_command_line_stay_as_they_are() -> None:
 def test_a_sweep_of_any_command_writes_under_outputs() -> None:
     for file in library_files("").values():
         if "hydra" in (cfg := OmegaConf.load(file)):
-            assert str(OmegaConf.to_container(cfg.hydra)["sweep"]["dir"]).startswith(
-                "outputs/sweeps/"
-            ), file
+            # A job's folder is its number: the sweep may change what the name would follow from.
+            (key,) = OmegaConf.to_container(cfg.hydra)["sweep"]
+            assert key == "dir" and "dir: outputs/sweeps/" in file.read_text(), file
 
 
 def test_the_same_words_give_equal_but_separate_configurations() -> None:
@@ -355,3 +355,12 @@ def test_a_model_without_a_name_is_refused_by_the_key_that_lacks(tmp_path: Path)
 )
 def test_a_composition_without_a_model_has_a_name_of_its_own(words: list[str], name: str) -> None:
     assert compose("train", words).name == name
+
+
+@pytest.mark.parametrize("word", ["memory.name=ttt", "integration.name=expert"])
+def test_another_part_does_not_keep_the_options_of_the_models_own(word: str) -> None:
+    key, _, name = word.partition(".name=")
+    with pytest.raises(UserError, match=f"would keep the options of .*Write {key}={name}, which"):
+        compose("train", ["model=framesamp_modul", word])
+    same = ["memory.name=framesamp", "integration.name=modulator", "name=train"]
+    assert compose("train", ["model=framesamp_modul", *same]).name == "train"

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -105,7 +106,7 @@ def test_all_parts_with_one_name_need_trust(install: Callable[..., None]) -> Non
 
 def test_an_entry_point_that_is_no_extension_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     class Entry:
-        name, value = "broken", "broken_package:EXTENSION"
+        name, value, dist = "broken", "broken_package:EXTENSION", None
 
         def load(self) -> object:
             raise ImportError("no module named broken_package")
@@ -134,6 +135,7 @@ class Entry:
 
     def __init__(self, name: str, extension: Extension) -> None:
         self.name, self.value, self.extension = name, f"{name}.names:EXTENSION", extension
+        self.dist = SimpleNamespace(name=f"{name}-package")
 
     def load(self) -> Extension:
         return self.extension
@@ -173,7 +175,10 @@ def test_a_part_whose_name_is_taken_names_both_owners(
     install(Extension(parts={key: {name: "first.part"}}))
     with pytest.raises(UserError) as refused:
         registry.extensions()
-    plugin = "the installed plugin 'first' (first.names:EXTENSION) (first.part)"
+    plugin = (
+        "the installed plugin 'first' of the package 'first-package' (first.names:EXTENSION)"
+        " (first.part)"
+    )
     kind = registry.REGISTRIES[key].kind
     assert str(refused.value) == (
         f"Two packages define the {kind} {name!r}: {owner}, and {plugin}. Rename it in one"

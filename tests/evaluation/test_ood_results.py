@@ -145,10 +145,10 @@ def test_the_papers_figures_do_not_stand_beside_other_episodes() -> None:
         assert results.methods[0].paper is None
         (note,) = [note for note in results.notes if "none of the benchmark's" in note]
         assert ("hard episodes alone" in note) == (split == "hard")
-    elsewhere = [replace(r, env="mine") for r in made("StopCube", "test", [1], "framesamp_modul")]
+    others = [replace(r, env="mine") for r in made("StopCube", "test", [1], "framesamp_modul")]
     alone = Protocol(("StopCube",), 1)
-    assert aggregate(elsewhere, alone).methods[0].paper is None
-    assert aggregate([replace(r, env=None) for r in elsewhere], alone).methods[0].paper
+    assert aggregate(others, alone).methods[0].paper is None
+    assert aggregate([replace(r, env=None) for r in others], alone).methods[0].paper
 
 
 def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
