@@ -34,7 +34,7 @@ from mme_vla.evaluation.results.curves import (
 )
 from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.paper import demo_records
-from mme_vla.evaluation.results.report import conclude, read_runs, training_details
+from mme_vla.evaluation.results.report import conclude, mixed_settings, read_runs, training_details
 from mme_vla.evaluation.results.scopes import (
     PAPER_ORDER,
     TASK_FACTS,
@@ -56,7 +56,7 @@ from mme_vla.evaluation.results.tables import (
     to_markdown,
 )
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
-from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.evaluation.store import files_below, find_records, read_folders
 from mme_vla.utils import require_replaceable
 from mme_vla.utils.pages import escape_markdown, render
 
@@ -103,7 +103,7 @@ def verify(args: argparse.Namespace) -> None:
     from mme_vla.evaluation import receipts
 
     import_plugins(args.plugins)
-    paths = sorted(args.receipt.rglob("receipt*.json"))
+    paths = files_below(args.receipt, "receipt*.json")
     if args.receipt.is_file():
         paths = [args.receipt]
     require(
@@ -122,8 +122,7 @@ def verify(args: argparse.Namespace) -> None:
         for line in lines:
             print(f"  {printable(line)}")
     # Results read these as well.
-    below = [*args.receipt.rglob("episodes*.jsonl"), *args.receipt.rglob("episodes*.jsonl.xz")]
-    for path in sorted(below):
+    for path in files_below(args.receipt, "episodes*.jsonl", "episodes*.jsonl.xz"):
         if not any(path.parent.glob("receipt*.json")):
             words.add("not compared")
             print(printable(f"{path}: not compared"))
@@ -194,6 +193,7 @@ def run(args: argparse.Namespace) -> None:
     comparisons = compare_all(_pairs(results, args.compare), protocol)
     for comparison in comparisons:
         results.notes += comparison.notes
+    results.notes += mixed_settings(find_records(args.runs))
     console = Console()
     for table in _tables(results, comparisons, detailed=not args.brief):
         print_table(table, console.width)
@@ -330,6 +330,7 @@ def show_tables(
             blocks.append(to_markdown(table))
             sections.append(Section(table.title, tables=[table]))
     notes += limit_notes(records)
+    notes += mixed_settings(find_records(args.runs))
     errors = sum(record.outcome == "error" for record in merge(records, args.conflicts))
     if errors:
         notes.append(f"{counted(errors, 'episode')} ended in an error, which counts as a failure.")

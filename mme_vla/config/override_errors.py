@@ -129,9 +129,8 @@ class ConfigTree:
                     f" {expected}."
                 )
             group, _, key = override.key_or_group.rpartition(".")
-            is_part = group != "" and key == "name"
-            has_file = is_part and value in self.loader.get_group_options(group)
-            if has_file and value != default:
+            is_name = group and key == "name"
+            if is_name and value != default and value in self.loader.get_group_options(group):
                 raise UserError(
                     f"{override.input_line!r} would keep the options of {default}. Write"
                     f" {group}={value}, which brings its own."

@@ -18,19 +18,17 @@ class Pairing[Key: Hashable]:
     keys: of the episodes whose scenes are the same in all runs, in the order of the first run.
     unnamed: of these, how many have no digest in any run, so that task, number and seed alone say
         that they are the same.
-    other: task → how many were left out because their scenes differ.
-    mixed: task → because only some of the runs name the scene.
+    other: task → how many were left out because their scenes differ, or only some runs name them.
     """
 
     keys: tuple[Key, ...]
     unnamed: int
     other: Mapping[str, int]
-    mixed: Mapping[str, int]
 
     @property
     def left_out(self) -> int:
         """How many episodes are common by task and number, and are not paired."""
-        return sum(self.other.values()) + sum(self.mixed.values())
+        return sum(self.other.values())
 
     def notes(self, what: str) -> list[str]:
         """What a reader has to know, one sentence each. what: which runs are compared."""
@@ -47,20 +45,14 @@ class Pairing[Key: Hashable]:
         """The notes on episodes that are not paired: all that matters where one command ran both
         sides.
         """
-        lines = []
-        if self.other:
-            lines.append(
-                f"{what}: {counted(sum(self.other.values()), 'episode')} not paired, for the"
-                f" scenes are different ones in these runs ({_by_task(self.other)}): they were"
-                " built by other versions or on other machines."
-            )
-        if self.mixed:
-            lines.append(
-                f"{what}: {counted(sum(self.mixed.values()), 'episode')} not paired, for only some"
-                f" of the runs name the scene ({_by_task(self.mixed)}): evaluate the others again"
-                " with this version."
-            )
-        return lines
+        if not self.other:
+            return []
+        tasks = ", ".join(f"{task} {count}" for task, count in self.other.items())
+        return [
+            f"{what}: {counted(self.left_out, 'episode')} not paired ({tasks}), for the scenes are"
+            " different ones in these runs, or only some of the runs name the scene: they were"
+            " built by other versions or on other machines. Evaluate them with one version."
+        ]
 
 
 def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]) -> Pairing[Key]:
@@ -76,7 +68,6 @@ def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]
     keys: list[Key] = []
     unnamed = 0
     other: Counter[str] = Counter()
-    mixed: Counter[str] = Counter()
     for key in sides[0]:
         if not all(key in side for side in sides):
             continue
@@ -85,16 +76,10 @@ def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]
             records += side[key]
         scenes = {record.named_scene for record in records if record.scene != NOT_BUILT}
         seeds = {record.seed for record in records}
-        if len(scenes - {None}) > 1 or len(seeds) > 1:
+        if len(scenes) > 1 or len(seeds) > 1:
             other[records[0].task] += 1
-        elif len(scenes) > 1:
-            mixed[records[0].task] += 1
         else:
             keys.append(key)
             if scenes <= {None}:
                 unnamed += 1
-    return Pairing(tuple(keys), unnamed, dict(other), dict(mixed))
-
-
-def _by_task(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{task} {count}" for task, count in counts.items())
+    return Pairing(tuple(keys), unnamed, dict(other))

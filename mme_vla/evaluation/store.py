@@ -7,10 +7,12 @@ import os
 import time
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
+from glob import glob
 from pathlib import Path
 from typing import Any
 
 from mme_vla.config.naming import digest, flat
+from mme_vla.config.sections import without
 from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.records import EpisodeRecord, read_records
 from mme_vla.utils import (
@@ -77,7 +79,9 @@ def begin_run(
     except FileExistsError:
         await_content(folder / RUN_FILE)
     there = read_run(folder)
-    if there["fingerprint"] != content["fingerprint"]:
+    if "split_sha256" not in there["settings"]:  # of a version that did not note it
+        settings = without(settings, "split_sha256")
+    if there["fingerprint"] != fingerprint(settings):
         earlier, later = flat(there["settings"]), flat(settings)
         changes = []
         for key in sorted({*earlier, *later}):
@@ -159,6 +163,19 @@ def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
     return [record for path in paths for record in read_records(path)]
 
 
+def files_below(folder: Path, *names: str) -> list[Path]:
+    """The files of these names in a folder or below, in order, each once; links to folders are
+    followed.
+    """
+    matches: list[str] = []
+    for name in names:
+        matches += glob(  # noqa: PTH207 - a `Path` follows no links below itself
+            f"**/{name}", root_dir=folder, recursive=True, include_hidden=True
+        )
+    paths = [folder / match for match in sorted(matches)]
+    return list({path.resolve(): path for path in reversed(paths)}.values())[::-1]
+
+
 def find_records(paths: Iterable[Path]) -> list[Path]:
     """The files behind a list of files and folders; of a folder, every `episodes*.jsonl`, or
     `.jsonl.xz`, below it.
@@ -170,7 +187,7 @@ def find_records(paths: Iterable[Path]) -> list[Path]:
             continue
         if not path.is_dir():
             raise UserError(f"{path} does not exist: name files of records, or folders.")
-        below = sorted([*path.rglob("episodes*.jsonl"), *path.rglob("episodes*.jsonl.xz")])
+        below = files_below(path, "episodes*.jsonl", "episodes*.jsonl.xz")
         if not below:
             raise UserError(
                 f"{path} holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below."

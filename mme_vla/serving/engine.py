@@ -37,9 +37,6 @@ class ServerStats:
         self.counts[kind] += 1
         self._seconds[kind].append(seconds)
 
-    def count(self, kind: str, by: int = 1) -> None:
-        self.counts[kind] += by
-
     def percentiles(self, kind: str) -> dict[str, float] | None:
         """p50, p95 and the longest in milliseconds, or None before the first."""
         seconds = self._seconds.get(kind)
@@ -196,7 +193,7 @@ class Engine:
         begun = time.perf_counter()
         chunks = await self.call(lambda: self._act([waiting.work for waiting in batch]))
         self.stats.took("batch", time.perf_counter() - begun)
-        self.stats.count("batched", len(batch))
+        self.stats.counts["batched"] += len(batch)
         for waiting, chunk in zip(batch, chunks, strict=True):
             if waiting.future.done():
                 continue

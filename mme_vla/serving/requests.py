@@ -254,12 +254,6 @@ class Flags(BaseModel):
     add_buffer: Flag = False
 
 
-class BufferMessage(BaseModel):
-    """`{"add_buffer": True, …}` of the MME-VLA schema. Its reader adds `images` and `state`."""
-
-    exec_start_idx: Index = 0
-
-
 class InferMessage(BaseModel):
     """What a request for actions can have in both schemas. Its reader adds what the robot sees."""
 
@@ -273,12 +267,6 @@ class InferMessage(BaseModel):
         return {kind: text for kind, text in texts.items() if text is not None}
 
 
-class ObservationMessage(InferMessage):
-    """The current observation, in the MME-VLA schema."""
-
-    prompt: Goal
-
-
 class ListMessage(InferMessage):
     """All frames since the last request. Its reader adds what the robot sees.
 
@@ -288,13 +276,6 @@ class ListMessage(InferMessage):
     task_goal: Goal
     is_first_step: Truth
     exec_start_idx: Index | None = None
-
-
-class ChallengeMessage(ListMessage):
-    """The same as the challenge has it: with the benchmark's two lists of states."""
-
-    joint_state_list: _shaped(None, ARM_JOINTS)  # type: ignore[valid-type]
-    gripper_state_list: _shaped(None, 2)  # type: ignore[valid-type]
 
 
 class RequestReader:
@@ -321,7 +302,10 @@ class RequestReader:
         depths = Annotated[np.ndarray, PlainValidator(partial(_depth, n_axes=3))]
 
         # One field for each camera and reading, by its name in the message.
-        observed: dict[str, Any] = {"state": (_shaped(width), Field(alias="observation/state"))}
+        observed: dict[str, Any] = {
+            "prompt": (Goal, ...),
+            "state": (_shaped(width), Field(alias="observation/state")),
+        }
         listed: dict[str, Any] = {}
         for camera in robot.cameras:
             key = f"observation/{camera.name}"
@@ -343,14 +327,21 @@ class RequestReader:
                 many = Field(alias=f"{pose_name}_list", description=meaning)
                 observed[f"see_{pose_name}"] = (_shaped(3, 4), one)
                 listed[f"see_{pose_name}"] = (_shaped(None, 3, 4), many)
-        self._observation = create_model("Observation", __base__=ObservationMessage, **observed)
+        self._observation = create_model("Observation", __base__=InferMessage, **observed)
         listed["executed_action_list"] = (_shaped(None, robot.action.width) | None, None)
-        self._challenge = create_model("Challenge", __base__=ChallengeMessage, **listed)
+        # The challenge has the benchmark's two lists of states, others have one.
+        self._challenge = create_model(
+            "Challenge",
+            __base__=ListMessage,
+            joint_state_list=(_shaped(None, ARM_JOINTS), ...),
+            gripper_state_list=(_shaped(None, 2), ...),
+            **listed,
+        )
         listed["state_list"] = (_shaped(None, width), ...)
         self._list = create_model("Frames", __base__=ListMessage, **listed)
         self._buffer = create_model(
             "Buffer",
-            __base__=BufferMessage,
+            exec_start_idx=(Index, 0),
             images=(buffer, ...),
             state=(_shaped(None, width), ...),
         )

@@ -224,7 +224,7 @@ class PolicyServer:
         headers = Headers(scope=scope)
         path = scope["path"] if scope["type"] == "http" else None
         if "origin" in headers and path != "/healthz":
-            self.stats.count("refused")
+            self.stats.counts["refused"] += 1
             return PlainTextResponse("Pages in a browser are not served.\n", 403)
         if path in OPEN or self.settings.api_key is None:
             return None
@@ -233,12 +233,12 @@ class PolicyServer:
         right = hmac.compare_digest(key.strip().encode(), self.settings.api_key.encode())
         if right and scheme.lower() == "api-key":
             return None
-        self.stats.count("refused")
+        self.stats.counts["refused"] += 1
         return PlainTextResponse("Send the header Authorization: Api-Key <key>.\n", 401)
 
     async def _refuse(self, request: Request, error: Exception) -> Response:
         """The reply to a request that is wrong, or that there is no place for."""
-        self.stats.count("refused")
+        self.stats.counts["refused"] += 1
         if not isinstance(error, HTTPException):
             logger.info("%s: refused: %s", _client(request), error)
             status = 400
@@ -276,7 +276,7 @@ class PolicyServer:
             body = await self._body(request)
             if place.ended:
                 raise HTTPException(503, FULL)
-            place.work()
+            place.waiting_since = None
             begun = time.perf_counter()
             message = await self._read(body)
             del body
@@ -285,7 +285,7 @@ class PolicyServer:
         except (HTTPException, UserError, BusyError):
             raise
         except Exception as error:
-            self.stats.count("failed")
+            self.stats.counts["failed"] += 1
             logger.exception("%s: failed", name[0])
             return PlainTextResponse(f"{error_text(error)}\n", 500)
         finally:
@@ -338,7 +338,7 @@ class PolicyServer:
         """Give a client a place, and reply to it until one of the two closes the connection."""
         place = self.places.take(socket.scope["client"], socket)
         if place is None:
-            self.stats.count("refused")
+            self.stats.counts["refused"] += 1
             await socket.send_denial_response(PlainTextResponse(f"{BUSY}\n", 503))
             return
         try:
@@ -346,10 +346,10 @@ class PolicyServer:
             await self._converse(socket, place)
         except WebSocketDisconnect as gone:
             if gone.code == 1009:
-                self.stats.count("refused")
+                self.stats.counts["refused"] += 1
                 logger.info("%s: message too large (limits.message_mib)", place.name)
         except TimeoutError:
-            self.stats.count("too_slow")
+            self.stats.counts["too_slow"] += 1
             logger.info("%s: took no reply for limits.send_s", place.name)
         finally:
             self.places.leave(place)
@@ -372,7 +372,7 @@ class PolicyServer:
                 coming = asyncio.ensure_future(socket.receive())
                 if place.ended:  # the client sent this before it knew
                     continue
-                place.work()
+                place.waiting_since = None
                 computing = asyncio.ensure_future(self._reply(session, event, place))
                 del event  # hundreds of megabytes that need not wait for the next request
                 await asyncio.wait([computing, coming], return_when=asyncio.FIRST_COMPLETED)
@@ -384,7 +384,7 @@ class PolicyServer:
                 if isinstance(reply, str) and not session.intact:
                     await _close(socket, 1011, reply)
                     return
-                place.wait()
+                place.waiting_since = time.monotonic()
                 if self.places.stopping:
                     self.places.end(place, STOPPING)
         finally:
@@ -404,12 +404,12 @@ class PolicyServer:
             begun = time.perf_counter()
             return await session.respond(await self._read(event["bytes"]), begun)
         except UserError as error:
-            self.stats.count("refused")
+            self.stats.counts["refused"] += 1
             logger.info("%s: refused: %s", place.name, error)
             return error_text(error)
         except Exception as error:
             session.intact = False
-            self.stats.count("failed")
+            self.stats.counts["failed"] += 1
             logger.exception("%s: failed", place.name)
             return error_text(error)
 
@@ -446,12 +446,6 @@ class Place:
         host, port = self.address
         return f"{host}:{port}"
 
-    def work(self) -> None:
-        self.waiting_since = None
-
-    def wait(self) -> None:
-        self.waiting_since = time.monotonic()
-
 
 class Places:
     """The clients that hold a place, and which connection is closed next.
@@ -483,7 +477,7 @@ class Places:
             longest = min(
                 waiting, key=lambda place: (place.socket is not None, place.waiting_since or 0.0)
             )
-            self._stats.count("let_go")
+            self._stats.counts["let_go"] += 1
             self.end(longest, FULL)
         place = Place(address, socket)
         self.taken.append(place)

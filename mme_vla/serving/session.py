@@ -310,7 +310,7 @@ class HttpSessions:
             if not silent:
                 raise BusyError(f"{len(self.entries)} sessions are at work, as many as fit here.")
             del self.entries[min(silent, key=lambda known: self.entries[known].used)]
-            self._engine.stats.count("let_go")
+            self._engine.stats.counts["let_go"] += 1
         self.entries[name] = SessionEntry(Session(self._engine, self._settings))
         return self.entries[name]
 

@@ -143,8 +143,7 @@ def test_the_papers_figures_do_not_stand_beside_other_episodes() -> None:
             made("StopCube", split, [1] * 12, model="framesamp_modul"), Protocol(("StopCube",), 12)
         )
         assert results.methods[0].paper is None
-        (note,) = [note for note in results.notes if "none of the benchmark's" in note]
-        assert ("hard episodes alone" in note) == (split == "hard")
+        assert any("none of the benchmark's" in note for note in results.notes)
     others = [replace(r, env="mine") for r in made("StopCube", "test", [1], "framesamp_modul")]
     alone = Protocol(("StopCube",), 1)
     assert aggregate(others, alone).methods[0].paper is None

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import mme_vla
+from helpers.rollout_fakes import quick_policy
 from mme_vla import UserError
 from mme_vla.cli import evaluate
 from mme_vla.config.composition import compose
@@ -23,6 +24,8 @@ from mme_vla.evaluation.records import (
     display_name,
     merge,
 )
+from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import (
     begin_run,
     check_run_folder,
@@ -146,6 +149,11 @@ def test_shards_of_a_folder_are_detected_once(tmp_path: Path) -> None:
         "a/episodes-1.jsonl",
         "b/episodes.jsonl",
     ]
+    (tmp_path / "b" / "up").symlink_to(tmp_path)
+    (tmp_path / "collected").mkdir()
+    (tmp_path / "collected" / "a").symlink_to(tmp_path / "a")
+    assert len(find_records([tmp_path / "b"])) == 3 == len(find_records([tmp_path]))
+    assert len(find_records([tmp_path / "collected"])) == 2, "links to folders are followed"
     with pytest.raises(UserError, match="does not exist"):
         find_records([tmp_path / "c"])
     (tmp_path / "c").mkdir()
@@ -218,6 +226,25 @@ def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     ):
         begin_run(tmp_path, other)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
+
+
+def test_a_run_does_not_continue_with_a_file_of_other_scenes(tmp_path: Path) -> None:
+    policy = quick_policy("pi05")
+    scenes = tmp_path / "scenes.jsonl"
+    settings = RolloutSettings(split=str(scenes))
+    facts = facts_of(policy, None, None, settings, None)
+
+    def begin(folder: str) -> dict[str, Any]:
+        return begin_run(tmp_path / folder, run_settings(policy, facts, settings))
+
+    earlier = run_settings(policy, facts, settings)  # as versions that did not read the file
+    begun = begin_run(tmp_path / "earlier", earlier)
+    scenes.write_text('{"task": "StopCube"}')
+    assert begin("new") == begin("new")
+    scenes.write_text('{"task": "BinFill"}')
+    with pytest.raises(UserError, match="other settings: split_sha256 was"):
+        begin("new")
+    assert begin("earlier") == begun
 
 
 def test_a_run_of_compressed_records_is_not_run_again(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
+from helpers.rollout_fakes import records as run_of
 from helpers.rollout_fakes import save_records
 from mme_vla import UserError
 from mme_vla.cli.results import main
@@ -788,3 +789,17 @@ def test_standing_baselines_are_below_a_line_in_the_tables() -> None:
     names = [row[0] for row in table.rows]
     assert names == ["framesamp_modul", "pi05", "present_modul", "actions_modul"]
     assert table.rules == {2}
+
+
+def test_folders_of_one_run_with_other_settings_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {"model": "m", "checkpoint": 1, "seed": 7, "policy": "p", "source": "here"}
+    for folder, execute in (("one", 16), ("same", 16), ("other", 4)):
+        begin_run(tmp_path / folder, {**settings, "execute": execute, "source": folder})
+        save_records(tmp_path / folder, run_of("test", [1]))
+    main([str(tmp_path / "one"), str(tmp_path / "same"), "--brief", "--samples", "20"])
+    assert "other settings" not in capsys.readouterr().out
+    main([str(tmp_path), "--brief", "--samples", "20"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "m, checkpoint 1, seed 7: one run here" in printed and "(execute 16 and 4)" in printed

@@ -14,7 +14,7 @@ import pandas as pd
 
 from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.make import ROBOMME
-from mme_vla.envs.metadata import BASE, HARD, base_of
+from mme_vla.envs.metadata import BASE, base_of
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, counted, did_you_mean, require
 from mme_vla.evaluation.pairing import pair
@@ -567,10 +567,10 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
     for method in methods:
         splits |= {record.split for record in method.table["record"] if record.task in TASK_FACTS}
     for split in sorted(splits - {BASE}):
-        what = f"other episodes than those of the {BASE} split"
-        if split == HARD:
-            what = f"the {BASE} split's hard episodes alone"
-        notes.append(f"Split {split!r}: {what}; figures of it are none of the benchmark's.")
+        notes.append(
+            f"Split {split!r}: figures of it are none of the benchmark's, which are of the {BASE}"
+            " split's episodes."
+        )
     if outside:
         notes.append(
             f"Left out: {counted(outside, 'record')} of other tasks, or of other episodes."

@@ -50,10 +50,8 @@ episodes.
 
 def base_of(split: str) -> str:
     """The split whose scenes a split varies, tiers counting as `ood`."""
-    variant = read_variant(split)
-    if variant is not None:
-        split = variant.base
-    return OOD if split.startswith(f"{OOD}:") else split
+    base = metadata.base_of(split)
+    return OOD if base.startswith(f"{OOD}:") else base
 
 
 def tier_tables(

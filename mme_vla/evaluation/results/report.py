@@ -8,7 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from mme_vla.config.naming import DEFAULT_BUDGET
+import pandas as pd
+
+from mme_vla.config.naming import DEFAULT_BUDGET, flat
 from mme_vla.errors import counted
 from mme_vla.evaluation.records import checkpoint_number
 from mme_vla.evaluation.results import plots
@@ -271,6 +273,28 @@ def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:
     """The `run.json` beside files of records, each once; records without one are passed over."""
     folders = dict.fromkeys(path.parent for path in records)
     return [read_run(folder) for folder in folders if (folder / RUN_FILE).is_file()]
+
+
+# Settings of a run that its records have too, or that they follow from
+_NAMES = ["model", "checkpoint", "seed", "split", "event", "policy", "subgoal.name"]
+
+
+def mixed_settings(records: Iterable[Path]) -> list[str]:
+    """A sentence for each run whose files are of folders with different settings."""
+    rows = [flat(content["settings"]) for content in read_runs(records)]
+    table = pd.DataFrame([row for row in rows if "policy" in row])  # not of a player
+    # A checkpoint may be at several places.
+    table = table.reindex(columns=[*_NAMES, *table.columns.difference([*_NAMES, "source"])])
+    notes = []
+    for (model, checkpoint, seed, *_), members in table.astype(str).groupby(_NAMES):
+        columns = members.loc[:, members.nunique() > 1].items()
+        values = "; ".join(f"{key} {' and '.join(sorted(set(column)))}" for key, column in columns)
+        if values:
+            notes.append(
+                f"{model}, checkpoint {checkpoint}, seed {seed}: one run here, though its folders"
+                f" have other settings ({values}). Name one of the folders."
+            )
+    return notes
 
 
 def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]]) -> str:

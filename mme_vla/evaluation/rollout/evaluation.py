@@ -11,6 +11,8 @@ from mme_vla.config.sections import read_section, without
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, make_env
+from mme_vla.envs.metadata import base_of
+from mme_vla.envs.rows import SUFFIX
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, counted
 from mme_vla.evaluation.claims import ALONE, Claims, Shard, Waiting, check_sharing
@@ -43,7 +45,7 @@ from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 from mme_vla.subgoal.background import BackgroundPredictor
-from mme_vla.utils import remove_drafts, safe_name
+from mme_vla.utils import file_sum, remove_drafts, safe_name
 from mme_vla.utils.processes import check_main_guard
 
 logger = logging.getLogger("mme_vla.evaluate")
@@ -486,8 +488,10 @@ def run_settings(
         "max_steps": settings.step_limit,
         "render": settings.render,
     }
+    scenes = Path(base_of(settings.split)).expanduser()
     # Left out where they are not set, as in runs from before there were these options.
     optional = {
+        "split_sha256": file_sum(scenes) if scenes.suffix == SUFFIX and scenes.is_file() else None,
         "event": settings.event,
         "max_actions": settings.max_actions,
         "only_possible": settings.only_possible,

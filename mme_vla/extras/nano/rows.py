@@ -19,7 +19,7 @@ from mme_vla.config.sections import NonNegative, NonNegativeInt, read_section
 from mme_vla.envs.metadata import episodes
 from mme_vla.errors import brief, listed, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, read_records
-from mme_vla.evaluation.store import RECORDS, RUN_FILE, find_records, read_run
+from mme_vla.evaluation.store import RECORDS, RUN_FILE, files_below, find_records, read_run
 from mme_vla.policy.saving import composition_digest
 from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.training_identity import TrainingIdentity
@@ -195,9 +195,7 @@ def _places(folders: Iterable[Path]) -> list[Path]:
             f"rows={folder}: there is no such folder. Name one that holds <row>/<training seed>.",
         )
         names = (RUN_FILE, TRAINED, "episodes*.jsonl", "episodes*.jsonl.xz")
-        below: set[Path] = set()
-        for name in names:
-            below.update(path.parent for path in folder.rglob(name))
+        below = {path.parent for path in files_below(folder, *names)}
         require(
             below, f"rows={folder} holds no row: no {TRAINED}, {RUN_FILE} or {RECORDS} below it."
         )
