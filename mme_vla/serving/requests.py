@@ -312,8 +312,10 @@ class RequestReader:
             # An error names the first of the two, which released clients send.
             keys = AliasChoices(self._released.get(camera.name, key), key)
             meaning = f"an image of the camera {camera.name!r}"
-            field = Field(validation_alias=keys, description=meaning)
-            observed[f"see_{camera.name}"] = (Image, field)
+            observed[f"see_{camera.name}"] = (
+                Image,
+                Field(validation_alias=keys, description=meaning),
+            )
             listed[f"see_{camera.name}"] = (one_size, Field(alias=f"{camera.name}_rgb_list"))
             if camera.depth:
                 depth_name, pose_name = camera.readings

@@ -358,7 +358,7 @@ def test_a_composition_without_a_model_has_a_name_of_its_own(words: list[str], n
 
 
 @pytest.mark.parametrize("word", ["memory.name=ttt", "integration.name=expert"])
-def test_another_part_does_not_keep_the_options_of_the_models_own(word: str) -> None:
+def test_another_part_does_not_keep_the_options_of_a_model(word: str) -> None:
     key, _, name = word.partition(".name=")
     with pytest.raises(UserError, match=f"would keep the options of .*Write {key}={name}, which"):
         compose("train", ["model=framesamp_modul", word])

@@ -791,7 +791,7 @@ def test_standing_baselines_are_below_a_line_in_the_tables() -> None:
     assert table.rules == {2}
 
 
-def test_folders_of_one_run_with_other_settings_are_told(
+def test_folders_of_one_run_with_other_settings_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = {"model": "m", "checkpoint": 1, "seed": 7, "policy": "p", "source": "here"}

@@ -281,14 +281,16 @@ _NAMES = ["model", "checkpoint", "seed", "split", "event", "policy", "subgoal.na
 
 def mixed_settings(records: Iterable[Path]) -> list[str]:
     """A sentence for each run whose files are of folders with different settings."""
-    rows = [flat(content["settings"]) for content in read_runs(records)]
-    table = pd.DataFrame([row for row in rows if "policy" in row])  # not of a player
+    runs = [run["settings"] for run in read_runs(records)]
+    table = pd.DataFrame([flat(run) for run in runs if "policy" in run])  # not of a player
     # A checkpoint may be at several places.
     table = table.reindex(columns=[*_NAMES, *table.columns.difference([*_NAMES, "source"])])
     notes = []
     for (model, checkpoint, seed, *_), members in table.astype(str).groupby(_NAMES):
-        columns = members.loc[:, members.nunique() > 1].items()
-        values = "; ".join(f"{key} {' and '.join(sorted(set(column)))}" for key, column in columns)
+        differing = members.loc[:, members.nunique() > 1]
+        values = "; ".join(
+            f"{key} {' and '.join(sorted(set(differing[key])))}" for key in differing
+        )
         if values:
             notes.append(
                 f"{model}, checkpoint {checkpoint}, seed {seed}: one run here, though its folders"
