@@ -28,6 +28,9 @@ def print_user_errors() -> Iterator[None]:
     Ctrl-C with 130 and SIGTERM with 143. Where the reader of standard output closes it, as `| head`
     does, the command ends quietly. Other exceptions pass.
     """
+    # As standard error does: a letter that the terminal's locale lacks is spelled out.
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")
     with _terminable():
         try:
             yield

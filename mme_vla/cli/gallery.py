@@ -95,7 +95,7 @@ def main(cfg: DictConfig) -> None:
             advance(1)
     names = list(dict.fromkeys(task for task, _, _ in entries))
     title = counted(len(names), "task") if len(names) > 1 else names[0]
-    page.write_text(render("gallery.md", title=title, entries=entries))
+    page.write_text(render("gallery.md", title=title, entries=entries), encoding="utf-8")
     print(f"{page}: {counted(len(entries), 'episode')}.")
 
 

@@ -48,7 +48,7 @@ def heading(file: Path) -> tuple[list[str], str]:
     """
     examples: list[str] = []
     text: list[str] = []
-    for line in file.read_text().splitlines():
+    for line in file.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
             break
         words = line.lstrip("# ")
@@ -61,7 +61,7 @@ def heading(file: Path) -> tuple[list[str], str]:
 
 def defaults(file: Path) -> Defaults:
     """What a file is composed of; overrides of Hydra's own groups are left out."""
-    content = yaml.safe_load(file.read_text()) or {}
+    content = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
     listed: list[Any] = content.get("defaults", []) if isinstance(content, dict) else []
     files = []
     groups = {}
@@ -155,7 +155,9 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
         files = {name: files[name]}
     parts = [f"Group {group}, by default {group}={groups[group]}"]
     for stem, file in files.items():
-        parts.append(f"{group}={stem}\n{textwrap.indent(file.read_text().rstrip(), '  ')}")
+        parts.append(
+            f"{group}={stem}\n{textwrap.indent(file.read_text(encoding='utf-8').rstrip(), '  ')}"
+        )
     return "\n\n".join(parts)
 
 
@@ -163,7 +165,7 @@ def _body(file: Path) -> str:
     """A file without the comment that it begins with and without Hydra's own sections."""
     lines: list[str] = []
     is_printed = True
-    for line in file.read_text().splitlines():
+    for line in file.read_text(encoding="utf-8").splitlines():
         if line and not line[0].isspace() and not line.startswith("#"):
             is_printed = not line.startswith(("defaults:", "hydra:"))
         if is_printed and (lines or not line.startswith("#")):

@@ -53,9 +53,9 @@ def main() -> None:
             ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it."
         )
         refs.append(ref)
-    readme = (SAMPLE / "README.md").read_text()  # of the shipped sample, which this replaces
+    readme = (SAMPLE / "README.md").read_bytes()  # of the shipped sample, which this replaces
     convert(refs, output, OPTIONS)
-    (output / "README.md").write_text(readme)
+    (output / "README.md").write_bytes(readme)
     size = sum(file.stat().st_size for file in output.rglob("*") if file.is_file())
     if size > LIMIT:
         shutil.rmtree(output)

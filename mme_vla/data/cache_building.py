@@ -240,7 +240,7 @@ def _build_episode(
         sums += sum_line(draft, path.name)
         # Tokens come last: where they are, all else is.
         with write_atomically(sum_file(folder, episode)) as sum_draft:
-            sum_draft.write_text(sums)
+            sum_draft.write_text(sums, encoding="utf-8")
 
 
 def _flush(file: IO[bytes]) -> None:

@@ -260,13 +260,13 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
 
 def _goals(root: Path, texts: Sequence[str]) -> tuple[str, ...]:
     """Goals as they are trained on, lower-case."""
-    for text in set(texts):
+    spelled = {text: text.lower() for text in texts}  # one text in memory for all its runs
+    for text in spelled:
         require(
             is_goal(text),
             f"{root}: the task {brief(text)} is empty or holds control characters (in {TASKS} or"
             " meta/episodes), and a policy is told what to do in words. Write the task there.",
         )
-    spelled = {text: text.lower() for text in set(texts)}  # one text in memory for all its runs
     return tuple(spelled[text] for text in texts)
 
 

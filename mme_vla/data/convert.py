@@ -345,7 +345,7 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
             side["options"] = episode.options
         if episode.frames is not None:
             side["frames"] = episode.frames
-    (draft / SIDE_FILE).write_text(json.dumps(side))
+    (draft / SIDE_FILE).write_text(json.dumps(side), encoding="utf-8")
     draft.rename(part)
 
 
@@ -422,7 +422,10 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
     # LeRobot writes its keys in the order of a set, another in each process
     stats = merged / "meta" / "stats.json"
-    stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
+    stats.write_text(
+        json.dumps(json.loads(stats.read_text(encoding="utf-8")), indent=4, sort_keys=True),
+        encoding="utf-8",
+    )
     episodes = []
     for i, part in enumerate(parts):
         facts = read_json(part / SIDE_FILE, "the facts of a converted episode")
@@ -431,5 +434,7 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
             side_file = SIDE_FILES["keyframes"].file_of(merged, i)
             side_file.parent.mkdir(exist_ok=True)
             shutil.copy(part / _KEYFRAMES, side_file)
-    (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
+    (merged / SIDE_FILE).write_text(
+        json.dumps({"plan": plan, "episodes": episodes}, indent=1), encoding="utf-8"
+    )
     write_sums(merged)  # LeRobot's format has none: damage would be read as data

@@ -187,5 +187,5 @@ def save_draft(draft: RobotDraft, folder: Path) -> tuple[Path, bool]:
     if path.exists():
         return path, False
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(draft.text)
+    path.write_text(draft.text, encoding="utf-8")
     return path, True

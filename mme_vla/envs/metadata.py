@@ -315,7 +315,11 @@ def episode(task: str, split: str = "test", index: int = 0) -> EpisodeSpec:
 
 @cache
 def _table(split: str) -> dict[str, list[EpisodeSpec]]:
-    text = files("mme_vla").joinpath("assets", "robomme_metadata", f"{split}.csv").read_text()
+    text = (
+        files("mme_vla")
+        .joinpath("assets", "robomme_metadata", f"{split}.csv")
+        .read_text(encoding="utf-8")
+    )
     table: dict[str, list[EpisodeSpec]] = {task: [] for task in TASK_NAMES}
     for row in csv.DictReader(text.splitlines()):
         table[row["task"]].append(

@@ -432,7 +432,9 @@ def _conditions(on_gpu: bool, renders: bool, folders: Iterable[str]) -> dict[str
 
     cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
-    if info.is_file() and (model := re.search(r"model name\s*:\s*(.+)", info.read_text())):
+    if info.is_file() and (
+        model := re.search(r"model name\s*:\s*(.+)", info.read_text(encoding="utf-8"))
+    ):
         cpu = model[1]
     gpu = None
     if on_gpu and torch.cuda.is_available():

@@ -136,13 +136,13 @@ def write_new(target: Path, text: str) -> None:
     """
     remove_drafts(target.parent)
     mine = draft_of(target)
-    mine.write_text(text)
+    mine.write_text(text, encoding="utf-8")
     try:
         os.link(mine, target)  # whole or not at all, and never over another's
     except FileExistsError:
         raise
     except OSError:  # a file system without hard links
-        with target.open("x") as file:
+        with target.open("x", encoding="utf-8") as file:
             file.write(text)
     finally:
         mine.unlink(missing_ok=True)

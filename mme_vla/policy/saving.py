@@ -249,13 +249,17 @@ def save_settings(
     checksums.
     """
     config = {**policy.config, **(facts or {})}
-    (folder / CONFIG).write_text(json.dumps(config, indent=2, ensure_ascii=False) + "\n")
+    (folder / CONFIG).write_text(
+        json.dumps(config, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
     names = [CONFIG]
     if self_check is None:
         (folder / SELF_CHECK).unlink(missing_ok=True)  # of the weights that lay here before
     else:
         names.append(self_check.write(folder))
-    (folder / CARD_FILE).write_text(model_card(policy, config, self_check is not None))
+    (folder / CARD_FILE).write_text(
+        model_card(policy, config, self_check is not None), encoding="utf-8"
+    )
     if policy.processor is not None:
         names += policy.processor.save(folder)
     return names

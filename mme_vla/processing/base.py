@@ -236,7 +236,9 @@ class PolicyProcessor:
         """Write `processor.json` and the statistics; the names of the files."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / CONFIG_FILE).write_text(json.dumps(self.to_config(), indent=2) + "\n")
+        (folder / CONFIG_FILE).write_text(
+            json.dumps(self.to_config(), indent=2) + "\n", encoding="utf-8"
+        )
         if self.stats is None:
             return [CONFIG_FILE]
         self.stats.save(folder / STATS_FILE)

@@ -308,7 +308,9 @@ def _places(folder: Path, step: int) -> tuple[Path, Path]:
 def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any) -> None:
     versions = {name: importlib.metadata.version(name) for name in ("mme-vla", "torch", "numpy")}
     about = {"format": FORMAT, "step": step, "config": dict(config), "versions": versions, **more}
-    (draft / STATE).write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+    (draft / STATE).write_text(
+        json.dumps(about, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
 
 
 def _publish(draft: Path, target: Path) -> Path:

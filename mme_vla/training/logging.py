@@ -126,7 +126,7 @@ def resident_gib() -> float:
     """Peak resident memory of this process; without /proc it may include the parent's."""
     with suppress(OSError):
         # getrusage begins with what the parent had when it started this process
-        for line in Path("/proc/self/status").read_text().splitlines():
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 2**20
     unit = 1 if sys.platform == "darwin" else 1024  # getrusage counts bytes on macOS, KiB elsewhere
@@ -218,7 +218,7 @@ def mlflow_tracker(
         artifacts = (folder / "mlflow").absolute().as_uri()
     mlflow.set_tracking_uri(tracking_uri)
     record = folder / "mlflow_id"
-    run_id = record.read_text() if record.is_file() else None
+    run_id = record.read_text(encoding="utf-8") if record.is_file() else None
     return MLflowTracker(project, artifacts, run_id=run_id, run_name=_run_name(folder))
 
 
@@ -231,8 +231,8 @@ def _run_id(folder: Path) -> str:
     record = folder / "wandb_id"
     if not record.is_file():
         with write_atomically(record) as draft:
-            draft.write_text(secrets.token_hex(4))
-    return record.read_text()
+            draft.write_text(secrets.token_hex(4), encoding="utf-8")
+    return record.read_text(encoding="utf-8")
 
 
 class Loggers:
@@ -305,11 +305,11 @@ def open_loggers(
         tracker.start()
         if isinstance(tracker, MLflowTracker):
             with write_atomically(folder / "mlflow_id") as draft:
-                draft.write_text(tracker.tracker.info.run_id)
+                draft.write_text(tracker.tracker.info.run_id, encoding="utf-8")
     lines = [line for line in read_metrics(folder) if line["step"] <= first_step]
     with write_atomically(folder / METRICS) as draft:
-        draft.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    return Loggers((folder / METRICS).open("a", buffering=1), tracker)
+        draft.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    return Loggers((folder / METRICS).open("a", buffering=1, encoding="utf-8"), tracker)
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:

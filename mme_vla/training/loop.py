@@ -422,7 +422,7 @@ def finish(
         line.say(f"plot: {folder / PLOT}")
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
     with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
-        draft.write_text(json.dumps(summary, indent=2) + "\n")
+        draft.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     line.say(
         f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (first and last twentieth"
         " of the run)"

@@ -81,7 +81,7 @@ class ShardWriter:
         parts.result()
         rank = distributed.get_rank(self._group)
         for file in (draft / SHARDS).glob(f"shard-{rank + 1:05d}-*.safetensors"):
-            file.with_suffix(".sha256").write_text(sum_line(file, file.name))
+            file.with_suffix(".sha256").write_text(sum_line(file, file.name), encoding="utf-8")
         distributed.barrier(self._group)
         if rank == 0:
             finish()

@@ -45,7 +45,9 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
         sums = pool.map(lambda name: file_sum(folder / name), files)
         table.update(zip(files, sums, strict=True))
     with write_atomically(folder / SUMS) as draft:
-        draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
+        draft.write_text(
+            "".join(f"{table[name]}  {name}\n" for name in sorted(table)), encoding="utf-8"
+        )
 
 
 class Sums:

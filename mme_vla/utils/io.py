@@ -483,7 +483,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
 def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
     """Write `value` as JSON in one rename; numbers that are not finite are refused (ValueError)."""
     with write_atomically(path) as draft:
-        draft.write_text(json.dumps(value, indent=indent, allow_nan=False) + "\n")
+        draft.write_text(json.dumps(value, indent=indent, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def draft_of(path: Path) -> Path:

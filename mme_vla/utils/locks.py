@@ -56,7 +56,7 @@ class FolderLock:
             except Timeout:
                 # What the lock's file says of the process that has it.
                 try:
-                    text = self.path.read_text(errors="replace")[:200].strip()
+                    text = self.path.read_text(errors="replace", encoding="utf-8")[:200].strip()
                     holder = text or "a process that has just started"
                 except OSError:
                     holder = "a process that has just ended"
@@ -69,7 +69,9 @@ class FolderLock:
                     raise
                 return self
         with suppress(OSError):  # a full disk: the lock holds without its text
-            self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}")
+            self.path.write_text(
+                f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8"
+            )
         return self
 
     def release(self) -> None:

@@ -47,15 +47,16 @@ class VideoWriter:
         preset: str = "veryfast",
     ) -> None:
         import av
-        import torch
 
         if isinstance(target, Path):
             target = str(target)
         self._container: Any = av.open(target, "w", format="mp4")
         self._rate = Fraction(fps)
         self._options = {"crf": str(crf), "preset": preset, "threads": "1"}
-        if torch.backends.cpu.get_cpu_capability() == "AVX512":
+        processor = Path("/proc/cpuinfo")
+        if processor.is_file() and b"avx512bw" in processor.read_bytes():
             # x264's AVX-512 routines read uninitialised memory: equal frames made unequal bytes.
+            # It has them wherever the CPU does, also where a variable hides that from PyTorch.
             self._options["x264-params"] = "asm=MMX2,SSE2Fast,SSSE3,SSE4.2,AVX,FMA3,BMI2,AVX2"
         self._stream: Any = None
         self.frames = 0

@@ -223,7 +223,7 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
     for write in futures:
         write.result()
     about = {"tree_metadata": leaves, "use_ocdbt": True, "use_zarr3": False}
-    (params / METADATA).write_text(json.dumps(about))
+    (params / METADATA).write_text(json.dumps(about), encoding="utf-8")
 
 
 def _holds_arrays(folder: Path) -> bool:

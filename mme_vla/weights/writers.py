@@ -225,7 +225,7 @@ def write_released(
     name = str(PolicySections.of(policy.config).name)
     for variant, target in VARIANTS.items():
         if target == name and name != "pi05":  # the memoryless baseline has no such file
-            (folder / VARIANT_FILE).write_text(f"{variant}.yaml\n")
+            (folder / VARIANT_FILE).write_text(f"{variant}.yaml\n", encoding="utf-8")
     tree = {leaf: cast(tensor, dtype) for leaf, tensor in to_released(policy).items()}
     write_orbax(tree, folder / "0" / "params")
     _write_assets(folder / "0", stats)

@@ -7,7 +7,7 @@ about, and a figure says how many of its episodes there are.
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 import pandas as pd
@@ -267,8 +267,7 @@ def aggregate(
     _check_environments(included)
     check_settings(included)
     table = record_table(included)
-    keys = {run: _method_key(run) for run in set(table["run"])}
-    table["method"] = [keys[run] for run in table["run"]]
+    table["method"] = list(map(cache(_method_key), table["run"]))
     by_method = table.groupby("method", sort=False)
     methods = [_method(key, members, protocol) for key, members in by_method]
     methods.sort(key=lambda method: is_standing(method.key.model))  # last in every table

@@ -51,9 +51,8 @@ class PaperResult(NamedTuple):
 
 def paper_table(name: str) -> list[dict[str, str]]:
     """Rows of one of the shipped files, by column."""
-    path = FOLDER / f"{name}.csv"
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    text = (FOLDER / f"{name}.csv").read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
 
 
 @cache

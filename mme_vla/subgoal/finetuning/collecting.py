@@ -143,9 +143,9 @@ def _build(
                 _build_episode(episode, output, sets, options)
                 advance(1)
         for name, path in rows_files.items():
-            with write_atomically(path) as draft, draft.open("w") as file:
+            with write_atomically(path) as draft, draft.open("w", encoding="utf-8") as file:
                 for episode in episodes:
-                    file.write(_part(output, name, episode).read_text())
+                    file.write(_part(output, name, episode).read_text(encoding="utf-8"))
     shutil.rmtree(output / PARTS, ignore_errors=True)
 
     # The checksums are written last: a file that they do not list is not compared.
@@ -155,7 +155,7 @@ def _build(
             if path.suffix in (".jsonl", ".png", ".mp4"):
                 files.append(str(path.relative_to(output)))
         write_sums(output, files)
-    return {name: path.read_text().count("\n") for name, path in rows_files.items()}
+    return {name: path.read_text(encoding="utf-8").count("\n") for name, path in rows_files.items()}
 
 
 def _build_episode(
@@ -187,7 +187,7 @@ def _build_episode(
     for name, built in sets_rows.items():
         lines = [json.dumps(row, ensure_ascii=False) + "\n" for row in built.rows]
         with write_atomically(_part(output, name, episode)) as draft:
-            draft.write_text("".join(lines))
+            draft.write_text("".join(lines), encoding="utf-8")
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:

@@ -50,7 +50,7 @@ def write_arguments(folder: Path, name: str) -> Path:
     """
     path = folder / f"swift_{name}.json"
     arguments = {**_ARGUMENTS, "dataset": [f"{name}.jsonl"], "output_dir": f"swift_{name}"}
-    path.write_text(json.dumps(arguments, indent=1) + "\n")
+    path.write_text(json.dumps(arguments, indent=1) + "\n", encoding="utf-8")
     return path
 
 

@@ -96,4 +96,4 @@ def write_diffusion_policy(
     if stats is not None:
         inner: dict[str, Any] = stats.to_dict()["norm_stats"]
         statistics = {"norm_stats": {"state": inner["state"], "action": inner["actions"]}}
-        (folder / STATS).write_text(json.dumps(statistics, indent=2) + "\n")
+        (folder / STATS).write_text(json.dumps(statistics, indent=2) + "\n", encoding="utf-8")

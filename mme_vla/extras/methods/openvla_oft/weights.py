@@ -255,4 +255,6 @@ def write_openvla(
         statistics = {}
         for name, feature in _FEATURES.items():
             statistics[feature] = getattr(stats, name).to_dict()
-        (folder / STATISTICS).write_text(json.dumps({DATASET: statistics}, indent=2) + "\n")
+        (folder / STATISTICS).write_text(
+            json.dumps({DATASET: statistics}, indent=2) + "\n", encoding="utf-8"
+        )

@@ -304,7 +304,7 @@ def write_simplememvla(
         "subtask_key": "subtask",
         "subtask_index_key": "subtask_online_index",
     }
-    (folder / CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+    (folder / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
     if target.processor is not None:
         (folder / TOKENIZER_FILE).write_text(
             target.require_processor().tokenizer.content, encoding="utf-8"
@@ -315,4 +315,4 @@ def write_simplememvla(
             shutil.copyfile(tokenizer, folder / TOKENIZER_FILE)
     if stats is not None:
         features = {"observation.state": stats.state.to_dict(), "action": stats.actions.to_dict()}
-        (folder / STATS).write_text(json.dumps(features, indent=2) + "\n")
+        (folder / STATS).write_text(json.dumps(features, indent=2) + "\n", encoding="utf-8")

@@ -117,7 +117,7 @@ def on_meta(model: str, budget: int | None = None, backbone: str | None = None) 
 def write_costs(costs: list[ModelCost], path: Path) -> None:
     """Write counts as CSV."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         columns = [member.name for member in fields(ModelCost)]
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()

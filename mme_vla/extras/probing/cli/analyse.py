@@ -162,7 +162,7 @@ def recurrence(args: argparse.Namespace) -> None:
     table = _beside(path, ".csv")
     require_replaceable(path, ".svg").parent.mkdir(parents=True, exist_ok=True)
     path.write_text(recurrence_plot(episode_curves, f"{name} on {source.name}"), encoding="utf-8")
-    with table.open("w", newline="") as file:
+    with table.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["episode", "frame", *episode_curves[0].curves])
         for curves in episode_curves:
@@ -416,7 +416,7 @@ def _print(title: str, columns: Sequence[str], rows: list[list[str]]) -> None:
 def _save(args: argparse.Namespace, values: dict[str, Any]) -> None:
     if args.output:
         require_replaceable(args.output, ".json").parent.mkdir(parents=True, exist_ok=True)
-        args.output.write_text(json.dumps(values, indent=1) + "\n")
+        args.output.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
         print(f"wrote {args.output}")
 
 
