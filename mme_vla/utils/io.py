@@ -224,7 +224,8 @@ def user_cache(kind: str) -> Path:
     """Where what can be made again is kept for this user: a folder in $MME_VLA_CACHE, else in
     ~/.cache/mme_vla.
     """
-    return Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / kind
+    # A user without a home folder, as in containers, has to name one.
+    return Path(os.environ.get("MME_VLA_CACHE") or Path.home() / ".cache" / "mme_vla") / kind
 
 
 _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}

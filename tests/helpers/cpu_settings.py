@@ -10,6 +10,7 @@ KERNELS = (
     {"MKL_CBWR": "COMPATIBLE"},
     {"MKL_CBWR": "AVX2"},
     {"ATEN_CPU_CAPABILITY": "default"},
+    {"ATEN_CPU_CAPABILITY": "avx2"},
 )
 THREADS = ({"OMP_NUM_THREADS": "1"}, {"OMP_NUM_THREADS": "2"})
 

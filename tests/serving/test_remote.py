@@ -523,16 +523,16 @@ def test_http_takes_no_reply_that_is_cut_short_or_has_no_end(
     monkeypatch.setattr("mme_vla.serving.remote.connections.LARGEST_REPLY", 1000)
     endless = Peer(b"HTTP/1.1 200 OK\r\n\r\n" + b"x" * 2000)
     with endless as peer, pytest.raises(UserError, match="malformed: more than 1,000 bytes"):
-        HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=5)
+        HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=60)
     with Peer(b"HTTP/1.1 200 OK\r\nContent-Length: 9\r\n\r\n\x80") as peer:
         peer.stop.set()  # closes after what it has written
         with pytest.raises(ConnectionError, match="IncompleteRead"):
-            HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=5)
+            HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=60)
 
 
 def test_http_connects_again_where_the_server_closed_a_silent_connection() -> None:
     with Peer(b"HTTP/1.1 200 OK\r\nContent-Length: 1\r\n\r\n\x80", hold_s=0) as peer:
-        connection = HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=5)
+        connection = HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=60)
         time.sleep(0.2)  # seconds of simulation
         assert connection.request({"reset": True}) == {}
         connection.close()
@@ -541,7 +541,7 @@ def test_http_connects_again_where_the_server_closed_a_silent_connection() -> No
 
 def test_http_sends_the_path_of_the_address() -> None:
     with Peer(b"HTTP/1.1 200 OK\r\nContent-Length: 1\r\n\r\n\x80") as peer:
-        HttpConnection(f"http://127.0.0.1:{peer.port}/policy/", timeout=5).close()
+        HttpConnection(f"http://127.0.0.1:{peer.port}/policy/", timeout=60).close()
     assert peer.received.startswith(b"GET /policy/metadata HTTP/1.1")
 
 
@@ -550,9 +550,9 @@ def test_no_redirect_is_followed() -> None:
         place = f"//127.0.0.1:{other.port}/"
         moved = b"HTTP/1.1 302 Found\r\nContent-Length: 0\r\nLocation: %s\r\n\r\n"
         with Peer(moved % f"ws:{place}".encode()) as peer, pytest.raises(UserError):
-            Client(f"ws://127.0.0.1:{peer.port}", api_key="k", open_timeout=2)
+            Client(f"ws://127.0.0.1:{peer.port}", api_key="k", open_timeout=60)
         with Peer(moved % f"http:{place}".encode()) as peer, pytest.raises(UserError, match="302"):
-            HttpConnection(f"http://127.0.0.1:{peer.port}", "k", timeout=2)
+            HttpConnection(f"http://127.0.0.1:{peer.port}", "k", timeout=60)
     assert other.received == b""
 
 

@@ -318,7 +318,7 @@ def test_a_key_is_requested(policy):
 def test_messages_name_an_address_without_its_user_and_password(policy, monkeypatch):
     with Served(policy) as served:
         port = served.server.port
-        with Client(f"ws://me:secret@127.0.0.1:{port}", timeout=5) as client:
+        with Client(f"ws://me:secret@127.0.0.1:{port}", timeout=60) as client:
 
             def say_nothing(timeout):
                 raise TimeoutError

@@ -252,3 +252,14 @@ def test_errors_that_cause_each_other_are_described_once() -> None:
     outer.__cause__ = full
     full.__cause__ = outer
     assert str(disk_trouble(outer)).startswith("/full/disk cannot be written or opened")
+
+
+def test_a_user_without_a_home_folder_has_the_caches_that_a_variable_names(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", home)
+    monkeypatch.setenv("MME_VLA_CACHE", str(tmp_path))
+    assert io.user_cache("robots") == tmp_path / "robots"

@@ -31,7 +31,7 @@ def bulb_file() -> Path:
 
 def ycb_file() -> Path:
     """A file of the YCB models where ManiSkill keeps what it downloads."""
-    root = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
+    root = Path(os.environ.get("MS_ASSET_DIR") or Path.home() / ".maniskill")
     return root.expanduser() / _YCB
 
 
