@@ -3,6 +3,7 @@ means.
 """
 
 import re
+import shlex
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -162,8 +163,7 @@ def resolve_checkpoint(path: Path) -> Path:
     newest = newest_checkpoint(path)
     if newest != path or (path / "config.json").is_file():
         return newest
-    trainings = trainings_in(path)
-    if trainings:
+    if trainings := trainings_in(path):
         raise UserError(
             f"{path} holds {len(trainings)} trainings of one recipe: name one of them, such as"
             f" {trainings[0]}. mme-vla evaluate and results take all of them."
@@ -174,9 +174,9 @@ def resolve_checkpoint(path: Path) -> Path:
         if step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir():
             raise UserError(
                 f"{path} is a checkpoint of the released code, in another format. Convert it, then"
-                f" name the new folder: mme-vla weights {path}"
-                f" {str(path).removesuffix('.zip')}_converted (with model=<model> where no"
-                " history_config.txt names the variant)."
+                f" name the new folder: mme-vla weights {shlex.quote(str(path))}"
+                f" {shlex.quote(str(path).removesuffix('.zip') + '_converted')} (with model=<model>"
+                " where no history_config.txt names the variant)."
             )
     require(
         str(path) not in shipped_checkpoints(),
