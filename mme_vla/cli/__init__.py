@@ -5,13 +5,14 @@
 import atexit
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.table import commands as commands
-from mme_vla.errors import require
+from mme_vla.errors import printable, require
 from mme_vla.registry import Command
 from mme_vla.utils.processes import started_processes
 
@@ -36,6 +37,7 @@ def run(name: str) -> None:
         if _PRINTING.isdisjoint(sys.argv[1:]):
             check_launcher(name)
         if command.reads_words or not command.config:
+            warnings.showwarning = _show_warning
             load_main(command)()
             return
         from mme_vla.cli.command import run_configured  # Hydra, which other commands do without
@@ -45,6 +47,11 @@ def run(name: str) -> None:
 
         main.__module__ = command.module
         run_configured(command.config, main, check=command.check)
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Print a warning without its place in the code."""
+    print(f"Warning: {printable(str(message))}", file=sys.stderr)
 
 
 def _end_quietly() -> None:

@@ -4,6 +4,8 @@ are paired.
 
 import csv
 import io
+import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from scipy.stats import binomtest
 
 from helpers.rollout_fakes import records as run_of
 from helpers.rollout_fakes import save_records
-from mme_vla import UserError
+from mme_vla import UserError, cli
 from mme_vla.cli.results import main
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results import paper
@@ -803,3 +805,18 @@ def test_folders_of_one_run_with_other_settings_are_named(
     main([str(tmp_path), "--brief", "--samples", "20"])
     printed = " ".join(capsys.readouterr().out.split())
     assert "m, checkpoint 1, seed 7: one run here" in printed and "(execute 16 and 4)" in printed
+
+
+def test_a_command_prints_a_warning_without_its_place_in_the_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_records(tmp_path, records("pi05", {"BinFill": [1, 0]}))
+    with (tmp_path / "episodes.jsonl").open("a") as file:
+        file.write('{"model": "pi')
+    monkeypatch.setattr(sys, "argv", ["mme-vla", str(tmp_path), "--brief"])
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # put back afterwards
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        cli.run("results")
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "half-written" in line]
+    assert line.startswith("Warning: ") and ".py:" not in line
