@@ -19,6 +19,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.envs.base import Environment, environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
+from mme_vla.envs.metadata import base_of
 from mme_vla.envs.robomme.recording.coverage import compare, goal_of, goals_recorded, in_words
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.envs.robomme.recording.outputs import EpisodeWriter, Job, RecordingPlan
@@ -199,6 +200,12 @@ def report_coverage(
 def plan(run: RecordRun) -> list[Job]:
     """The episodes that a configuration names."""
     specs = choose_episodes(run.tasks, run.episodes, run.split)
+    base = base_of(run.split)
+    require(
+        base == run.split,
+        f"split={run.split} varies scenes for evaluations, and a recording has the scenes as"
+        f" they are: record split={base}.",
+    )
     require(
         run.frames != "all" or run.memory is None,
         "frames=all draws every frame, those of a memory too: leave out memory, or set frames.",

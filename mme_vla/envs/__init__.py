@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
     from mme_vla.envs.make import load_tasks, make_env
-    from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec, episode, episodes
+    from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec, episode
     from mme_vla.envs.vector.pool import Job, Reply, VecEnv, make_vec_env
 
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "RoboMMEEnv",
     "VecEnv",
     "episode",
-    "episodes",
     "load_tasks",
     "make_env",
     "make_vec_env",
@@ -33,7 +32,6 @@ _HOMES = {
     "TASK_NAMES": "metadata",
     "VecEnv": "vector.pool",
     "episode": "metadata",
-    "episodes": "metadata",
     "load_tasks": "make",
     "make_env": "make",
     "make_vec_env": "vector.pool",

@@ -12,7 +12,9 @@ which become the conditioning video), `frozen` (on reset: steps in which no acti
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from itertools import count
 from string import ascii_lowercase
 from typing import Any, ClassVar, Literal
 
@@ -21,7 +23,7 @@ import numpy as np
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs.facts import Candidates, Fact
-from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
+from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec, numbered
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import UserError, check_known, listed, require
@@ -32,8 +34,9 @@ Actions = Iterable[Any]
 CHOICES = "multi_choice"
 OPTIONS = "available_multi_choices"
 _FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
-_OTHER_SPLITS = 2_000_000  # first seed of splits with other names
+_OTHER_SPLITS, _APART = 2_000_000, 1_000_000  # first seed of splits with other names, and between
 _END = object()  # of a choice's actions, each of which can be any value
+CLOSED = "The environment is closed; make a new one."
 _MAX_IDLE = 4  # environments that a process keeps for further episodes
 
 
@@ -152,11 +155,10 @@ class Environment(ABC):
         """
         self.check_task(task)
         self.check_split(split)
-        first = _FIRST_SEED.get(split, _OTHER_SPLITS)
-        specs = []
-        for number in range(self.splits[split]):
-            specs.append(EpisodeSpec(task, split, number, first + number, ""))
-        return specs
+        others = [name for name in self.splits if name not in _FIRST_SEED]
+        first_seeds = _FIRST_SEED | dict(zip(others, count(_OTHER_SPLITS, _APART), strict=False))
+        first = first_seeds[split]
+        return [EpisodeSpec(task, split, i, first + i, "") for i in range(self.splits[split])]
 
     # What commands call ---------------------------------------------------------------------------
 
@@ -198,14 +200,7 @@ class Environment(ABC):
 
     def episode(self, task: str, split: str, number: int) -> EpisodeSpec:
         """One episode of a split."""
-        known = self.episodes(task, split)
-        exists = type(number) is int and 0 <= number < len(known)
-        require(
-            exists,
-            f"Unknown episode {number!r} of {task}, split {split!r}; expected 0 to"
-            f" {len(known) - 1}.",
-        )
-        return known[number]
+        return numbered(self.episodes(task, split), task, split, number)
 
     def scene_digest(self, spec: EpisodeSpec) -> str:
         """Digest of the scene that an episode has on this machine: builds it. `NO_VALUES` without
@@ -280,15 +275,16 @@ class Environment(ABC):
         row: builds the scene of these values (`twin`).
         """
         spec = self.episode(task, split, episode)
-        limit = max_steps or self.task_limit(task, split)
-        env = None
-        if row is None:
-            env = _idle.pop((type(self), task, render), None)
-        else:
+        if max_steps is None:
+            max_steps = self.task_limit(task, split)
+        if row is not None:
             spec = replace(spec, row=row)
+        env = None
+        if spec.row is None:
+            env = _idle.pop((type(self), task, render), None)
         if env is None:
             env = self.make(spec, render)
-        return EpisodeEnv(self, env, spec, limit, action_space == CHOICES, render)
+        return EpisodeEnv(self, env, spec, max_steps, action_space == CHOICES, render)
 
 
 def _group_of(task: str, grouping: Mapping[str, Sequence[str]]) -> str | None:
@@ -349,6 +345,10 @@ class EpisodeEnv:
         by_choice: bool = False,
         render: bool = True,
     ) -> None:
+        require(
+            type(max_steps) is int and max_steps >= 1,
+            f"max_steps is {max_steps!r}; expected a positive integer.",
+        )
         self.environment = environment
         self.env = env
         self.spec = spec
@@ -380,7 +380,10 @@ class EpisodeEnv:
             parts = [self.hold_action] * action.steps
             self._limit += action.steps
         elif self._by_choice:
-            parts = self._choices[action["choice"].lower()]
+            letter = action.get("choice") if isinstance(action, Mapping) else action
+            letter = str(letter).strip().lower()
+            check_known("choice", letter, self._choices)
+            parts = self._choices[letter]
         remaining = iter(parts)
         part = next(remaining, _END)
         if part is _END:  # what was chosen is done already: a step passes, or none ever would
@@ -402,10 +405,6 @@ class EpisodeEnv:
     def render_image(self, image: Callable[[], np.ndarray]) -> np.ndarray:
         """The image [H, W, 3] that a function of the environment renders."""
         return image()
-
-    def render(self) -> Any:
-        """What the environment renders."""
-        return self.env.render()
 
     def oracle(self) -> Mapping[str, Any] | None:
         """The choice that a script takes next; None where the environment has no method `oracle()`,
@@ -459,7 +458,7 @@ class EpisodeEnv:
         observation, info = self._begin()
         self.success = False
         *video, frame = self._first_frames(observation, info)
-        actions = self.environment.demonstrate(self.env)
+        actions = iter(self.environment.demonstrate(self.env))
         action: Any = next(actions, None)
         require(action is not None, f"{self.spec.task}: the demonstrator gives no action.")
         for earlier in video:
@@ -477,6 +476,7 @@ class EpisodeEnv:
 
     def _begin(self) -> tuple[Mapping[str, Any], dict[str, Any]]:
         """Reset the environment to the scene of the episode."""
+        require(self.env is not None, CLOSED)
         self._is_reusable = False
         observation, info = self.env.reset(seed=self.spec.seed)
         self._is_reusable = True
@@ -493,6 +493,7 @@ class EpisodeEnv:
 
     def _perform(self, action: Any) -> tuple[Mapping[str, Any], float, bool, bool, dict[str, Any]]:
         """Perform one action; with `success="once"` the first success ends the episode."""
+        require(self.env is not None, CLOSED)
         self._is_reusable = False
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._is_reusable = True
@@ -521,25 +522,26 @@ class EpisodeEnv:
         """An observation with its images: those that are functions are rendered now, or left
         out where they were not requested.
         """
-        frame = dict(observation)
+        frame: dict[str, Any] = {}
         requested = self.render_request
         for name, value in observation.items():
             if not callable(value):
-                continue
-            if requested is None or name in requested.cameras(self._frames, newest):
+                frame[name] = value
+            elif requested is None or name in requested.cameras(self._frames, newest):
                 frame[name] = self.render_image(value)
             else:
                 frame[name] = None
+        frame = deepcopy(frame)  # an environment may write each observation over the one before
         # Every frame has the names of the first, or images would be of other frames than states.
         if self._frames == 0:
             require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
             self._names = set(frame)
-        place = f"{self.spec.task}: frame {self._frames} of the episode"
-        remedy = "Give the same cameras and the state in every observation."
-        missing = sorted(self._names - set(frame))
-        require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
-        added = sorted(set(frame) - self._names)
-        require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
+        require(
+            set(frame) == self._names,
+            f"{self.spec.task}: frame {self._frames} of the episode has {listed(sorted(frame))},"
+            f" and frame 0 has {listed(sorted(self._names))}. Give the same cameras and the state"
+            " in every observation.",
+        )
         self._frames += 1
         return frame
 

@@ -1,7 +1,7 @@
 """The grammar of `tasks=`, `episodes=` and `split=`, the same for all commands."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from mme_vla.envs.base import environment
@@ -49,9 +49,13 @@ def check_episodes(episodes: Any, key: str = "episodes") -> None:
 
     key: for the message.
     """
-    if episodes is None or episodes == ALL or type(episodes) is int:
+    if _are_all(episodes) or type(episodes) is int:
         return
     spans(episodes, key, GRAMMAR)
+
+
+def _are_all(episodes: Any) -> bool:
+    return episodes is None or (isinstance(episodes, str) and episodes == ALL)
 
 
 def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[int]:
@@ -63,7 +67,7 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
             alone, `3` the first three.
         count: of episodes in `what`, which messages name.
     """
-    if episodes is None or episodes == ALL:
+    if _are_all(episodes):
         return list(range(count))
     if isinstance(episodes, int) and not isinstance(episodes, bool):
         problem = f"episodes={episodes} means the first {episodes}; {what} has {count}."
@@ -134,8 +138,8 @@ def spans(value: Any, key: str, grammar: str) -> list[range]:
     parts: Sequence[Any] = [None]
     if isinstance(value, str):
         parts = value.split(",")
-    elif isinstance(value, Sequence):
-        parts = value
+    elif isinstance(value, Iterable):
+        parts = list(value)
     ranges = []
     for part in parts:
         match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))

@@ -6,6 +6,7 @@ Importing this module registers the tasks, and Gymnasium imports what stands bef
 """
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -15,7 +16,7 @@ from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE, benchmark_stat
 from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.make import load_tasks, make_env
 from mme_vla.envs.metadata import TASK_NAMES, episodes, step_limit
-from mme_vla.errors import check_choice, check_known, require
+from mme_vla.errors import check_choice, check_known, listed, require
 from mme_vla.registry import REWARDS, TASKS
 
 _POSITION, _ANGLE = 2.0, 2 * np.pi  # bounds of a commanded pose: metres and radians
@@ -77,12 +78,11 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         self.episode = episode
         self.images = images or render_mode is not None
         self.render_mode = render_mode
-        # The environment itself times out a step after its limit, as the benchmark does.
         self._limit = limit
         self._options: dict[str, Any] = {
             "action_space": action_space,
             "reward": reward,
-            "max_steps": max(limit - 1, 1),
+            "max_steps": limit,
         }
         self._count = len(episodes(task, split))
         self._env: RoboMMEEnv | None = None
@@ -115,14 +115,17 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         3}` names one.
         """
         super().reset(seed=seed)
-        number = (options or {}).get("episode", self.episode)
+        options = options or {}
+        unknown = sorted(set(options) - {"episode"})
+        require(not unknown, f"Unknown reset options {listed(unknown)}; there is episode alone.")
+        number = options.get("episode", self.episode)
         if number is None:
             number = int(self.np_random.integers(self._count))
         frames, info = self._open(number).reset()
         self._take(frames)
         images = frames.get("front_rgb_list", [])[:-1]
         video = tuple(np.asarray(image, np.uint8) for image in images)
-        return self._copy(), {**self._info(info), "episode": number, "video": video}
+        return deepcopy(self._observation), {**self._info(info), "episode": number, "video": video}
 
     def step(
         self, action: np.ndarray
@@ -138,13 +141,17 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         if steps >= self._limit and not terminated:
             truncated = True
             info = {**info, "status": "timeout"}
-        return self._copy(), float(reward), bool(terminated), bool(truncated), self._info(info)
+        return (
+            deepcopy(self._observation),
+            float(reward),
+            bool(terminated),
+            bool(truncated),
+            self._info(info),
+        )
 
     def render(self) -> np.ndarray | None:
         """The newest front image [256, 256, 3]."""
-        if not self.images or not self._observation:
-            return None
-        return self._observation["front"].copy()
+        return None if self._env is None else self._env.render()
 
     def close(self) -> None:
         """Free the simulator; closing twice is harmless."""
@@ -168,9 +175,6 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         self._observation["state"] = benchmark_state(
             frames["joint_state_list"][-1], frames["gripper_state_list"][-1]
         )
-
-    def _copy(self) -> dict[str, np.ndarray]:
-        return {name: value.copy() for name, value in self._observation.items()}
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         status = str(info.get("status", ""))

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.envs.base import Hold
+from mme_vla.envs.base import CLOSED, Hold
 from mme_vla.envs.facts import Candidates, Fact, TaskFacts
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.metadata import DEFAULT_STEPS
@@ -46,7 +46,6 @@ log = logging.getLogger(__name__)
 
 FrameHook = Callable[[dict[str, Any], dict[str, Any], bool], None]
 """Called with each returned frame, its info, and whether it belongs to the conditioning video."""
-_CLOSED = "The environment is closed; make a new one."
 _REACH = 1.2  # metres from the arm's base; what was moved away lies ten metres off
 _MARGIN = 2  # The benchmark counts two steps more than its limit.
 
@@ -305,7 +304,7 @@ class RoboMMEEnv(gymnasium.Env):
         """The newest front image [256, 256, 3]; None if it was not rendered, or before the first
         reset.
         """
-        require(self._task is not None, _CLOSED)
+        require(self._task is not None, CLOSED)
         return None if self._run is None else self._run.newest.get("front_rgb")
 
     def close(self) -> None:
@@ -318,7 +317,7 @@ class RoboMMEEnv(gymnasium.Env):
     def task(self) -> "Task":
         """The simulated task."""
         if self._task is None:
-            raise UserError(_CLOSED)
+            raise UserError(CLOSED)
         return self._task
 
     @property
@@ -483,6 +482,6 @@ class RoboMMEEnv(gymnasium.Env):
     def _require_run(self) -> _Run:
         if self._run is None:
             raise UserError(
-                _CLOSED if self._task is None else "step() before reset(): call reset() first."
+                CLOSED if self._task is None else "step() before reset(): call reset() first."
             )
         return self._run

@@ -71,6 +71,7 @@ def make_env(
         The environment; call `reset()` first. Close it when done.
     """
     check_names(task, action_space, difficulty, seed)
+    variant = metadata.check_split(split)
     if max_steps is None:
         max_steps = metadata.step_limit(split)
     if row is not None:
@@ -81,6 +82,11 @@ def make_env(
         )
         scene = spec.options
     elif seed is not None:
+        require(
+            variant is None,
+            f"seed={seed} builds a scene of no split, and split={split} varies those of one: leave"
+            " out one of them.",
+        )
         scene = {"seed": seed, "difficulty": difficulty}
     else:
         scene = metadata.episode(task, split, episode).options
@@ -98,10 +104,9 @@ def make_env(
     obs_mode = "none"
     if include.maniskill_obs:
         obs_mode = "rgb+depth+segmentation" if render else "state_dict"
-    require_simulator()
+    simulated = make_task(task, render=render, obs_mode=obs_mode, **scene)
     from mme_vla.envs.interface import RoboMMEEnv
 
-    simulated = make_task(task, render=render, obs_mode=obs_mode, **scene)
     return RoboMMEEnv(simulated, action_space, max_steps, include, render, reward)
 
 
@@ -131,8 +136,11 @@ def load_tasks(*tasks: str) -> None:
     """
     require_simulator()
     for task in tasks or TASK_NAMES:
-        module = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", task).lower()  # `pick_xtimes` of `PickXtimes`
-        import_module(f"mme_vla.envs.robomme.tasks.{module}")
+        check_task_name(task)
+        if task in TASK_NAMES:
+            # `pick_xtimes` of `PickXtimes`
+            module = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", task).lower()
+            import_module(f"mme_vla.envs.robomme.tasks.{module}")
 
 
 def make_task(
@@ -146,10 +154,7 @@ def make_task(
         obs_mode: ManiSkill's observation mode.
         options: of the scene, such as `seed` and `difficulty`.
     """
-    if task in TASK_NAMES:
-        load_tasks(task)
-    else:
-        require_simulator()
+    load_tasks(task)
     backend = "none"
     if render:
         backend = render_backend()

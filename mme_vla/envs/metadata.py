@@ -7,10 +7,11 @@ succeeded (see benchmarks/episode_seeds.py).
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
+from numbers import Integral
 from typing import Any
 
 from mme_vla.envs.rows import (
@@ -124,14 +125,17 @@ def dials_of(task: str) -> list[str]:
 
 def read_variant(split: str) -> Variant | None:
     """The variant that a split names; None for any other text."""
+    require(
+        isinstance(split, str), f"split={split!r} is no text, such as 'test' or 'scenes.jsonl'."
+    )
     if split == TWIN:
         return Variant(twin=True)
-    if str(split).startswith(f"{TWIN}:"):
+    if split.startswith(f"{TWIN}:"):
         base = split.removeprefix(f"{TWIN}:")
         varied = read_variant(base) or Variant(base=base)
         require(not varied.twin, f"split={split!r}: name {TWIN} once, as {TWIN}:{varied.base}.")
         return replace(varied, twin=True)
-    if not str(split).startswith(STRESS):
+    if not split.startswith(STRESS):
         return None
     match = _STRESS.fullmatch(split)
     if match is None:
@@ -237,7 +241,7 @@ def formula(task: str, split: str, episode: int) -> tuple[int, str]:
 
 def check_task_name(task: str) -> None:
     """Make sure that a task is the benchmark's or registered."""
-    check_known("task", task, dict.fromkeys([*TASK_NAMES, *TASKS]))
+    check_known("task", task, all_tasks())
 
 
 def episodes(task: str, split: str = "test") -> list[EpisodeSpec]:
@@ -281,7 +285,7 @@ def check_split(split: str) -> Variant | None:
     """Make sure that a split exists; returns its variant where it has one."""
     base = base_of(split)
     if base not in KNOWN and not is_row_split(base):
-        known = did_you_mean(str(base), [*KNOWN, TWIN, STRESS])
+        known = did_you_mean(base, [*KNOWN, TWIN, STRESS])
         raise UserError(f"Unknown split {split!r}. {known} A file of scenes ends in .jsonl.")
     return read_variant(split)
 
@@ -303,14 +307,18 @@ def _spec_of(row: Mapping[str, Any], split: str, number: int) -> EpisodeSpec:
 
 def episode(task: str, split: str = "test", index: int = 0) -> EpisodeSpec:
     """One episode of a split."""
-    known = episodes(task, split)
+    return numbered(episodes(task, split), task, split, index)
+
+
+def numbered(known: Sequence[EpisodeSpec], task: str, split: str, number: int) -> EpisodeSpec:
+    """The episode of this number among the known ones of a task in a split."""
     require(known, f"{task} has no episodes in split {split!r}.")
-    exists = type(index) is int and 0 <= index < len(known)
+    is_number = isinstance(number, Integral) and not isinstance(number, bool)
     require(
-        exists,
-        f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.",
+        is_number and 0 <= number < len(known),
+        f"Unknown episode {number!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.",
     )
-    return known[index]
+    return known[number]
 
 
 @cache

@@ -9,6 +9,7 @@ Everything else is here.
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
+from numbers import Integral
 from typing import Any, ClassVar
 
 import torch
@@ -26,6 +27,7 @@ from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import check_known, require
 
 RECOVERY_MODES = ("z", "xy")
+_SEEDS = 2**63  # of a generator of random numbers
 
 
 def candidates_among(things: Sequence[Thing], correct: Sequence[Thing]) -> Candidates:
@@ -82,7 +84,10 @@ class Task(Stage):
         row: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        require(seed >= 0, f"seed is {seed}; expected a non-negative integer.")
+        require(
+            isinstance(seed, Integral) and 0 <= seed < _SEEDS,
+            f"seed is {seed!r}; expected a non-negative integer below 2^63.",
+        )
         if robomme_failure_recovery:
             recovery = robomme_failure_recovery_mode or recovery
             require(
@@ -119,7 +124,7 @@ class Task(Stage):
         """Index, among the picks of the execution, of the one that a recovery demonstration fails
         first.
         """
-        super().__init__(*args, seed=seed, **kwargs)
+        super().__init__(*args, seed=int(seed), **kwargs)
 
     def turned(self, dial: str) -> int:
         """How far a dial is turned; 0 as in the benchmark."""

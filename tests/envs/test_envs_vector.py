@@ -275,8 +275,8 @@ def test_processes_begin_with_the_settings_of_their_time_and_all_imports_left_ou
     ("arguments", "words"),
     [
         ({"tasks": "StopCub"}, "Did you mean 'StopCube'"),
-        ({"tasks": []}, "No task"),
-        ({"tasks": "StopCube", "episodes": [50]}, "expected 0 to 49"),
+        ({"tasks": []}, "at least one"),
+        ({"tasks": "StopCube", "episodes": [50]}, "which has 50: 0 to 49"),
         ({"tasks": "StopCube", "workers": 0}, "positive integer"),
         ({"tasks": "StopCube", "timeout": 0}, "positive number"),
         ({"tasks": "StopCube", "action_space": "joints"}, "joint_angle"),

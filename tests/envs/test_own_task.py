@@ -45,6 +45,15 @@ def test_make_env_gives_it_the_benchmarks_interface_and_draws_its_order() -> Non
     assert len(goals) == 2
 
 
+def test_gymnasium_gives_it_too() -> None:
+    from mme_vla.envs.gym import GymTask
+
+    env = GymTask("TwoButtons", episode=0, images=False)
+    _, info = env.reset()
+    assert "button" in info["goal"]
+    env.close()
+
+
 def test_a_policy_is_evaluated_on_it_in_a_worker_process(tmp_path: Path) -> None:
     policy = small_policy(
         "framesamp_context", backbone={"vision": {**SMALL_VISION, "patch_size": 16}}

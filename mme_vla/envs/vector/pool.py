@@ -26,11 +26,13 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from mme_vla.envs.base import environment, open_episode
-from mme_vla.envs.make import ROBOMME, check_names, make_env
+from mme_vla.envs.episodes import choose_episodes
+from mme_vla.envs.make import ACTION_SPACES, ROBOMME, make_env
 from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import SceneError, UserError, require, text_of
+from mme_vla.errors import SceneError, UserError, check_known, require, text_of
+from mme_vla.registry import REWARDS
 from mme_vla.utils.processes import check_main_guard, signals_deferred
 
 
@@ -358,7 +360,7 @@ def serve(inherited: Any, connection: Any, factory: Callable[..., Any]) -> None:
 
 def make_vec_env(
     tasks: str | Sequence[str],
-    episodes: Iterable[int] | None = None,
+    episodes: Any = None,
     workers: int = 2,
     split: str = "test",
     action_space: str = "joint_angle",
@@ -373,34 +375,25 @@ def make_vec_env(
     """Environments for all given episodes of all given tasks.
 
     Args:
-        tasks: one task name or several.
-        episodes: episode numbers of every task; by default all of the split.
+        tasks, episodes: as in `choose_episodes`; by default all of the split.
         workers: number of processes; more than the machine has cores is of no use.
-        split: `train`, `val` or `test`.
+        split: as for `make_env`.
         action_space, max_steps, render, reward, include: as for `make_env`; the last two are for
             RoboMME alone.
         timeout: seconds after which a command without result counts as hung.
         env: the environment whose tasks these are.
     """
-    names = [tasks] if isinstance(tasks, str) else list(tasks)
-    require(names, "No task given; expected a task name or several.")
-    source = environment(env)
-    source.check_installed()
+    environment(env).check_installed()
     # A process would end with a traceback.
     require(
         env == ROBOMME or (reward == "none" and include is None),
         f"env={env} takes no reward and no include: they are for env={ROBOMME}.",
     )
-    selection = None if episodes is None else list(episodes)
-    jobs = []
-    for name in names:
-        if env == ROBOMME:
-            check_names(name, action_space)
-        numbers = selection
-        if numbers is None:
-            numbers = list(range(len(source.episodes(name, split))))
-        for number in numbers:
-            jobs.append(Job(name, split, source.episode(name, split, number).episode))
+    if env == ROBOMME:
+        check_known("action space", action_space, ACTION_SPACES)
+        check_known("reward", reward, REWARDS)
+    specs = choose_episodes(tasks, episodes, split, env)
+    jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     shared: dict[str, Any] = {
         "action_space": action_space,
         "max_steps": max_steps,

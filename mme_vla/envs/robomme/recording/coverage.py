@@ -45,22 +45,21 @@ def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, 
 
 @dataclass
 class TaskCoverage:
-    """Of one task: how many goals and episodes there are, and the numbers of the episodes whose
-    goal is missing.
-    """
+    """Of one task: the numbers of the episodes with each goal, and which goals were recorded."""
 
-    goals: int = 0
-    episodes: int = 0
-    missing: dict[str, list[int]] = field(default_factory=dict)
+    recorded: set[str]
+    goals: dict[str, list[int]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
+        missing = {goal: i for goal, i in self.goals.items() if goal not in self.recorded}
+        episodes = sum(map(len, self.goals.values()))
         return {
-            "goals": self.goals,
-            "goals_covered": self.goals - len(self.missing),
-            "episodes": self.episodes,
-            "episodes_covered": self.episodes - sum(map(len, self.missing.values())),
-            "missing": self.missing,
+            "goals": len(self.goals),
+            "goals_covered": len(self.goals) - len(missing),
+            "episodes": episodes,
+            "episodes_covered": episodes - sum(map(len, missing.values())),
+            "missing": missing,
         }
 
 
@@ -74,15 +73,9 @@ def compare(
         requested: episodes with their goals.
     """
     coverage: dict[str, TaskCoverage] = {}
-    known_goals: dict[str, set[str]] = {}
     for spec, goal in requested:
-        task = coverage.setdefault(spec.task, TaskCoverage())
-        task.episodes += 1
-        if goal not in recorded.get(spec.task, set()):
-            task.missing.setdefault(goal, []).append(spec.episode)
-        if goal not in known_goals.setdefault(spec.task, set()):
-            known_goals[spec.task].add(goal)
-            task.goals += 1
+        task = coverage.setdefault(spec.task, TaskCoverage(recorded.get(spec.task, set())))
+        task.goals.setdefault(goal, []).append(spec.episode)
     return coverage
 
 
@@ -92,9 +85,9 @@ def in_words(coverage: Mapping[str, TaskCoverage]) -> str:
     for name, task in coverage.items():
         counts = task.to_dict()
         lines.append(
-            f"{name}: {counts['goals_covered']} of {task.goals} goals of 'test',"
-            f" {counts['episodes_covered']} of {task.episodes} episodes"
+            f"{name}: {counts['goals_covered']} of {counts['goals']} goals of 'test',"
+            f" {counts['episodes_covered']} of {counts['episodes']} episodes"
         )
-        for goal, numbers in task.missing.items():
+        for goal, numbers in counts["missing"].items():
             lines.append(f"  never shown: {goal} (episode {listed(numbers, 5)})")
     return "\n".join(lines)

@@ -46,7 +46,10 @@ class EpisodeWriter:
         choices = [choice.option.to_dict() for choice in task.choices()]
         setup = self._episode.create_group("setup")
         setup["seed"] = np.int64(task.seed)
-        texts = {"difficulty": task.difficulty, "available_multi_choices": json.dumps(choices)}
+        texts = {
+            "difficulty": task.tier or task.difficulty,
+            "available_multi_choices": json.dumps(choices),
+        }
         if frames is not None:
             texts["frames"] = json.dumps(frames.to_dict())
         for name, text in texts.items():
