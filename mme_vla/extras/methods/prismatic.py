@@ -205,5 +205,7 @@ class Angles(nn.Module):
         """Angles' cos and sin [b, n, h] at positions [b, n], in x's dtype: as transformers' layers
         take them.
         """
-        rope = rotation(position_ids, self.head_dim)
-        return rope.cos.squeeze(2).to(x.dtype), rope.sin.squeeze(2).to(x.dtype)
+        cos, signed_sin = rotation(position_ids, self.head_dim)
+        # Its first half is negative, where transformers' layers negate what is multiplied.
+        sin = signed_sin.chunk(2, dim=-1)[1].repeat(1, 1, 1, 2)
+        return cos.squeeze(2).to(x.dtype), sin.squeeze(2).to(x.dtype)

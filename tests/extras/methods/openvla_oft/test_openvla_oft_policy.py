@@ -10,6 +10,7 @@ from torch import Tensor
 from mme_vla import UserError, build_policy
 from mme_vla.extras.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.extras.methods.openvla_oft.processor import OpenVlaProcessor
+from mme_vla.extras.methods.prismatic import Angles
 from mme_vla.testing import check_backbone
 from mme_vla.testing.small import random_batch, unit_stats
 from mme_vla.types import Batch
@@ -44,6 +45,16 @@ def batch_for(policy: OpenVlaPolicy) -> Batch:
 def test_it_keeps_a_backbones_contract() -> None:
     # of the towers the last but one layer is read
     check_backbone("openvla", r"vlm\.(vision\.(dino|siglip)\.|language\.lm_head)", **SMALL)
+
+
+def test_its_language_model_rotates_by_the_angles_of_transformers() -> None:
+    import transformers
+    from transformers.models.llama.modeling_llama import LlamaRotaryEmbedding
+
+    sizes = transformers.LlamaConfig(hidden_size=16, num_attention_heads=2)
+    x, positions = torch.zeros(1, 3, 16), torch.tensor([[0, 1, 7]])
+    ours, theirs = Angles(8)(x, positions), LlamaRotaryEmbedding(sizes)(x, positions)
+    torch.testing.assert_close(ours, theirs)
 
 
 @pytest.mark.parametrize("name", MODELS)
