@@ -148,17 +148,16 @@ class ExpertLayer(nn.Module):
         """
         x, gate = self.attention_norm(x, condition)
         heads = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
-        v = heads[..., -self.kv_heads :, :]
-        queries_and_keys = heads[..., : -self.kv_heads, :]
+        # Split and not sliced: the gradient of each slice would fill a whole matrix.
+        queries = 0 if self.keys_only else self.heads
         if torch.compiler.is_compiling() and not torch.is_grad_enabled():
             # Each by itself: compiled code then rotates keys straight into the cache.
-            q = None
-            if not self.keys_only:
-                q = rotate(queries_and_keys[..., : self.heads, :], rope)
-            return q, rotate(queries_and_keys[..., -self.kv_heads :, :], rope), v, gate
-        qk = rotate(queries_and_keys, rope)  # in one go: queries first, keys last
-        k = qk[..., -self.kv_heads :, :]
-        return None if self.keys_only else qk[..., : self.heads, :], k, v, gate
+            q, k, v = heads.split([queries, self.kv_heads, self.kv_heads], dim=-2)
+            return None if self.keys_only else rotate(q, rope), rotate(k, rope), v, gate
+        queries_and_keys, v = heads.split([queries + self.kv_heads, self.kv_heads], dim=-2)
+        # In one go: queries first, keys last.
+        q, k = rotate(queries_and_keys, rope).split([queries, self.kv_heads], dim=-2)
+        return None if self.keys_only else q, k, v, gate
 
     def feed_forward(
         self,

@@ -112,13 +112,18 @@ def test_a_full_size_chunk_launches_few_kernels(
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
-    ("model", "launches", "products"),
-    [("pi05", 2070, 655), ("framesamp_modul", 2770, 876)],
+    ("model", "way", "launches", "products"),
+    [
+        ("pi05", "compiled", 2070, 655),
+        ("framesamp_modul", "compiled", 2770, 876),
+        ("pi05", "eager", 3680, 655),
+        ("framesamp_modul", "eager", 5060, 876),
+    ],
 )
-def test_a_compiled_full_size_update_launches_few_kernels(
-    model: str, launches: int, products: int, mock_driver: Path
+def test_a_full_size_update_launches_few_kernels(
+    model: str, way: str, launches: int, products: int, mock_driver: Path
 ) -> None:
-    words = ("gpu_kernels.py", model, "--what", "update", "--ways", "compiled", "--batch", "1")
+    words = ("gpu_kernels.py", model, "--what", "update", "--ways", way, "--batch", "1")
     counted = json.loads(run_on(mock_driver, *words).splitlines()[-1])
     assert counted["launches"] <= launches
     assert counted["products"] == products
