@@ -73,8 +73,8 @@ class VisionTower(nn.Module):
         dtype = compute_dtype(vit.head.weight)
         x = x.to(dtype)
         # Where the weights have the compute dtype, autocast would only cast those of the norms.
-        casts = any(weight.dtype != dtype for weight in vit.parameters())
-        casts = casts and torch.is_autocast_enabled(kind)
+        casts = torch.is_autocast_enabled(kind)
+        casts = casts and any(weight.dtype != dtype for weight in vit.parameters())
         with fused_kernels(x), torch.autocast(kind, dtype, enabled=casts):
             if frame_mask is None:
                 for block in vit.blocks:

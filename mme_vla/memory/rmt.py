@@ -89,13 +89,15 @@ class RMTLayer(RecurrentLayer):
             qkv_weight = torch.cat([self.q.weight.float(), kv_weight])
             frames = layer_norm(self.pre_norm, x.float())
             frame_k, frame_v = self._heads(frames, kv_weight, frame_rope)  # b t p kv h
+            # Unbound and split, not sliced: the gradient of each slice would fill the whole tensor.
+            frame_keys, frame_values = frame_k.unbind(1), frame_v.unbind(1)
             changes = []
             for t in range(x.shape[1]):
                 normed = layer_norm(self.pre_norm, slots.float())
                 slot_qk, slot_v = self._heads(normed, qkv_weight, slot_rope)
-                q, slot_k = slot_qk.tensor_split([-self.kv_heads], -2)
-                k = torch.cat([frame_k[:, t], slot_k], 1)
-                v = torch.cat([frame_v[:, t], slot_v], 1)
+                q, slot_k = slot_qk.split([slot_qk.shape[-2] - self.kv_heads, self.kv_heads], -2)
+                k = torch.cat([frame_keys[t], slot_k], 1)
+                v = torch.cat([frame_values[t], slot_v], 1)
                 output = linear(self.out, self._attend(q, k, v)) + slots.float()
                 updated = layer_norm(self.post_norm, output).to(slots.dtype)
                 new = torch.where(valid[:, t, None, None], updated, slots)
@@ -117,9 +119,9 @@ class RMTLayer(RecurrentLayer):
         which are last: their pairs (2i, 2i + 1), by angles with cosines and sines [n, 1, h/2].
         """
         heads = nn.functional.linear(x, weight).unflatten(-1, (-1, self.head_dim))
-        qk, v = heads.tensor_split([-self.kv_heads], -2)
+        qk, v = heads.split([heads.shape[-2] - self.kv_heads, self.kv_heads], -2)
         cos, sin = rope
-        a, b = qk[..., 0::2], qk[..., 1::2]
+        a, b = qk.unflatten(-1, (-1, 2)).unbind(-1)
         rotated = [a * cos - b * sin, a * sin + b * cos]
         if self.rotation == "cosine_only":
             rotated = [a * cos, b * cos]

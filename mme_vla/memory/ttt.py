@@ -119,21 +119,23 @@ class TTTLayer(RecurrentLayer):
             n_read = min(steps, max(window - following, 0))
             first_read = steps - n_read
             q = layer_norm(self.q_norm, self._by_head(linear(self.q, x[:, first_read:])))
+            # Unbound and not indexed: the gradient of each index would fill all frames.
+            keys, values, rates, queries = (each.unbind(1) for each in (k, v, rate, q))
             head_outputs = []
             numbers: list[Statistics] = []
             for t in range(steps):
                 real = valid[:, t, None, None]
                 before = (weight, bias)
-                new_weight, new_bias, norms = self.learn(weight, bias, k[:, t], v[:, t], rate[:, t])
+                new_weight, new_bias, norms = self.learn(weight, bias, keys[t], values[t], rates[t])
                 weight = torch.where(real[..., None], new_weight, weight)
                 bias = torch.where(real, new_bias, bias)
                 if t >= first_read:
-                    query = q[:, t - first_read]
+                    query = queries[t - first_read]
                     output = self.inner(weight, bias, query).output + query
                     head_outputs.append(torch.where(real[..., None], output, 0))
                 if statistics:
                     after = (weight, bias)
-                    numbers.append(self._statistics(before, after, k[:, t], v[:, t], norms))
+                    numbers.append(self._statistics(before, after, keys[t], values[t], norms))
             if n_read:
                 mixed = torch.stack(head_outputs, 1).transpose(2, 3).flatten(3)  # b t p d
                 y = x[:, first_read:] + linear(self.out, layer_norm(self.out_norm, mixed))

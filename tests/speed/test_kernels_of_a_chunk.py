@@ -118,6 +118,8 @@ def test_a_full_size_chunk_launches_few_kernels(
         ("framesamp_modul", "compiled", 2770, 876),
         ("pi05", "eager", 3680, 655),
         ("framesamp_modul", "eager", 5060, 876),
+        ("rmt_context", "eager", 9860, 1719),
+        ("ttt_expert", "eager", 15260, 1517),
     ],
 )
 def test_a_full_size_update_launches_few_kernels(
