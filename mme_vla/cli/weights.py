@@ -9,6 +9,7 @@ import math
 import re
 import shutil
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from mme_vla.errors import UserError, counted, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
+from mme_vla.processing.base import STATS_FILE
 from mme_vla.weights.load import adapter_of, read_as
 from mme_vla.weights.source import Source, formats, method_formats, open_source
 from mme_vla.weights.statistics import read_stats
@@ -174,6 +176,23 @@ def convert(
     trees = [] if config_dir is None else [Path(config_dir).resolve()]
     policy = _policy(opened, overrides, trees, trust_plugins)
     check_target(policy, to)
+    stats = None
+    if not dry_run:
+        stats = read_stats(opened.folder, asset)
+    is_relative = bool(policy.embodiment.action.relative)
+    if (
+        stats is not None
+        and opened.format == "lerobot"
+        and not (opened.folder / STATS_FILE).is_file()
+        and is_relative != bool(opened.config.get("use_relative_actions"))
+    ):
+        stats = None
+        warnings.warn(
+            f"The statistics of {opened.folder} are left out: they are of"
+            f" {'absolute' if is_relative else 'relative'} actions, and the robot"
+            f" {policy.embodiment.name!r} has {'relative' if is_relative else 'absolute'} ones.",
+            stacklevel=2,
+        )
     tensors = read_as(policy, opened)
     if dry_run:
         print_mapping(policy, opened, to)
@@ -184,7 +203,6 @@ def convert(
         policy.processor = build_processor(policy.config)
     with torch.no_grad():
         assign_tensors(policy, tensors, str(source), torch.float32)
-    stats = read_stats(opened.folder, asset)
     if policy.processor is not None and stats is not None:
         policy.processor.stats = stats
     draft = target.with_name(f".{target.name}.partial")

@@ -119,9 +119,9 @@ class BackgroundPredictor(SubgoalPredictor):
             return
         if not wait and not self._prediction.done():
             return
-        subgoals = self._prediction.result()
-        self._prediction = None
-        for episode, subgoal in zip(self._queried_episodes, subgoals, strict=True):
+        prediction = self._prediction
+        self._prediction = None  # an error is raised once: the next question may be answered
+        for episode, subgoal in zip(self._queried_episodes, prediction.result(), strict=True):
             episode.subgoal = subgoal
             episode.query_step = episode.inner.query_step
             episode.answered = True

@@ -26,13 +26,11 @@ class MemerEpisode(SubgoalEpisode):
         reach: how many frames back the next question may show.
 
     keyframes: frame number → image.
-    queried: whether there was a question yet.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str, reach: int) -> None:
         super().__init__(goal, video, task)
         self.keyframes: dict[int, np.ndarray] = {}
-        self.queried = False
         self._recent: dict[int, np.ndarray] = {}
         self._reach = reach
 
@@ -47,7 +45,7 @@ class MemerEpisode(SubgoalEpisode):
 
     def recent(self, count: int, stride: int) -> dict[int, np.ndarray]:
         """Return the recent frames that the next question shows, by number."""
-        numbers = recent_frames(self.step, self.queried, count, stride)
+        numbers = recent_frames(self.step, self.query_step is not None, count, stride)
         return {t: self._recent[t] for t in numbers}
 
 
@@ -95,7 +93,6 @@ class Memer(VLMPredictor):
 
     def read(self, episode: MemerEpisode, reply: str) -> Subgoal:
         recent = episode.recent(self.recent, self.stride)
-        episode.queried = True
         try:
             parsed, positions = parse_memer(reply, len(recent))
         except MalformedReply as error:

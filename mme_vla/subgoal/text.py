@@ -5,6 +5,7 @@ reads pixels of the 256×256 front image, `<row, column>`. An answer that cannot
 `MalformedReply`, which the predictors count.
 """
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -156,11 +157,13 @@ def parse_subgoal(reply: str) -> Parsed:
     """Read the answer of a fine-tuned predictor: text with `<|box_start|>(a,b)<|box_end|>` points.
 
     Raises:
-        MalformedReply: it is empty, or a point is damaged.
+        MalformedReply: it is empty, or holds a damaged point or a mark of this library's questions.
     """
     text = " ".join(reply.split())
     if not text:
         raise MalformedReply("the answer is empty")
+    if any(mark in text for mark in (IMAGE, VIDEO, BBOX)):  # the next question repeats the answer
+        raise MalformedReply(f"the answer holds a mark of questions: {IMAGE}, {VIDEO} or {BBOX}")
     points: list[Point] = []
 
     def pixel(match: re.Match[str]) -> str:
@@ -210,7 +213,11 @@ def parse_gemini(reply: str) -> str:
     for remainder in _SUBGOAL_KEY.findall(reply):
         quoted = _QUOTED.search(remainder)
         if quoted and quoted[1].strip():
-            return _writable(quoted[1].strip().replace('\\"', '"'))
+            try:
+                text = json.loads(quoted[0])
+            except ValueError:  # a backslash that JSON does not know
+                text = quoted[1].replace('\\"', '"')
+            return _writable(text.strip())
     text = json_object(reply).get("subgoal")
     if not isinstance(text, str) or not text.strip():
         raise MalformedReply("the answer names no subgoal")

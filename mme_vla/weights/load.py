@@ -97,6 +97,16 @@ def load_weights(
 def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     """Read a checkpoint in the names of a policy of its own variant."""
     if source.format == "ours":
+        # Token ids may mean other words.
+        if policy.processor is not None and (source.folder / CONFIG_FILE).is_file():
+            prompt = policy.processor.prompt_spec
+            fingerprint = read_settings(source.folder).get("tokenizer_fingerprint")
+            require(
+                None in (fingerprint, prompt.fingerprint) or fingerprint == prompt.fingerprint,
+                f"{source.folder} was trained with another tokenizer ({brief(fingerprint)}) than"
+                f" {prompt.encoder!r} ({prompt.fingerprint}): its ids would mean other words. Set"
+                " processor.tokenizer to that one.",
+            )
         return merge_state(source.tensors(), PolicySections.of(source.config).adapters)
     if source.format in ("lerobot", "openpi"):
         check_window(policy, source.config, str(source.folder))
@@ -170,17 +180,7 @@ def _match_local(
     """The tensors of a checkpoint of ours that a policy has too, and the names of a memory's that
     it has not.
     """
-    tensors = merge_state(checkpoint.tensors(), PolicySections.of(checkpoint.config).adapters)
-    # Token ids may mean other words.
-    if policy.processor is not None and (checkpoint.folder / CONFIG_FILE).is_file():
-        prompt = policy.processor.prompt_spec
-        fingerprint = read_settings(checkpoint.folder).get("tokenizer_fingerprint")
-        require(
-            None in (fingerprint, prompt.fingerprint) or fingerprint == prompt.fingerprint,
-            f"{checkpoint.folder} was trained with another tokenizer ({brief(fingerprint)}) than"
-            f" {prompt.encoder!r} ({prompt.fingerprint}): its ids would mean other words. Set"
-            " processor.tokenizer to that one.",
-        )
+    tensors = read_as(policy, checkpoint)
     state = policy.state_dict()
     left = []
     components = policy.finetune_spec.components.items()

@@ -311,7 +311,7 @@ def open_archive(file: Path) -> tuple[Zipped, Path]:
                 f"{file} holds no checkpoint of the released code: there are no Orbax arrays in it."
             )
         within = tuple(name.removeprefix(place) for name in names if name.startswith(place))
-        folder = _unpack_facts(file, opened, entries)
+        folder = _unpack_facts(file, opened, entries, place)
     return Zipped(file.resolve(), place, within), folder
 
 
@@ -357,7 +357,7 @@ def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
 
 def _arrays(names: list[str]) -> str | None:
     """The folder of the arrays, with a slash at its end: `params` before others, the outermost that
-    holds arrays.
+    holds arrays, of several steps the newest.
     """
     stores = [name.removesuffix(MANIFEST) for name in names if name.split("/")[-1] == MANIFEST]
     if not stores:
@@ -365,34 +365,43 @@ def _arrays(names: list[str]) -> str | None:
             if name.endswith(tuple(ARRAY_FILES)):
                 *above, _, _ = name.split("/")  # without the array's folder and file
                 stores.append("/".join([*above, ""]).lstrip("/"))
-    return min(
-        stores,
-        key=lambda place: (not place.endswith("params/"), place.count("/"), place),
-        default=None,
-    )
+
+    def rank(place: str) -> tuple[bool, int, int, str]:
+        step = re.search(r"(?:^|/)(\d{1,18})/params/$", place)
+        number = int(step[1]) if step else 0
+        return (not place.endswith("params/"), place.count("/"), -number, place)
+
+    return min(stores, key=rank, default=None)
 
 
-def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.ZipInfo]) -> Path:
-    """Write the variant's name and the statistics, as a released step has them, and return the
-    folder.
+def _unpack_facts(
+    file: Path, opened: zipfile.ZipFile, entries: list[zipfile.ZipInfo], place: str
+) -> Path:
+    """Write the variant's name and the statistics that belong to the arrays at `place`, as a
+    released step has them, and return the folder.
     """
     key = file.resolve(), file.stat().st_mtime_ns
     if key in _facts:
         return Path(_facts[key].name)
-    unpacked = _facts[key] = tempfile.TemporaryDirectory(prefix="mme-vla-")
+    unpacked = tempfile.TemporaryDirectory(prefix="mme-vla-")
     folder = Path(unpacked.name)
     for entry in entries:
         *above, last = entry.filename.split("/")
         if last == VARIANT_FILE:
-            target = folder / VARIANT_FILE
-        elif last == "norm_stats.json" and above:
-            target = folder / "assets" / safe_name(above[-1]) / last
+            target = folder / last
+        elif last == "norm_stats.json" and "assets" in above:
+            start = above.index("assets")
+            target = folder.joinpath("assets", *map(safe_name, above[start + 1 :]), last)
+            above = above[:start]
         else:
             continue
+        if not place.startswith("/".join([*above, ""])):
+            continue  # of another step
         if entry.file_size > _SMALL:
             raise UserError(
                 f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}"
             )
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(opened.read(entry))
+    _facts[key] = unpacked
     return folder

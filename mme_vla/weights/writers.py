@@ -222,7 +222,11 @@ def write_released(
 ) -> None:
     """A run with one step, 0, as the released JAX code lays it out."""
     policy = mme_of(policy, "The released layout")
-    name = str(PolicySections.of(policy.config).name)
+    sections = PolicySections.of(policy.config)
+    name = str(sections.name)
+    if policy.memory is not None:  # its parts may be others than those that the name stands for
+        integration = sections.integration["name"].replace("modulator", "modul")
+        name = f"{sections.memory['name']}_{integration}"
     for variant, target in VARIANTS.items():
         if target == name and name != "pi05":  # the memoryless baseline has no such file
             (folder / VARIANT_FILE).write_text(f"{variant}.yaml\n", encoding="utf-8")

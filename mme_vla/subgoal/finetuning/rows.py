@@ -111,12 +111,11 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
             ]
         }
         if kind == "grounded":
-            boxes = [list(point) for point in points]
-            if options.noise is not None:
-                least, most = options.noise
-                for number, point in enumerate(points):
-                    moved = np.array(point) + rng.integers(least, most + 1, 2)
-                    boxes[number] = np.clip(moved, 0, SIDE - 1).tolist()
+            least, most = options.noise or (0, 0)
+            boxes = []
+            for point in points:
+                moved = np.array(point) + rng.integers(least, most + 1, 2)
+                boxes.append(np.clip(moved, 0, SIDE - 1).tolist())
             row["objects"] = {"ref": [], "bbox": boxes}
         row["images"] = names
         if video:

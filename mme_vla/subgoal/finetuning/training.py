@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, counted, missing_extra, require
-from mme_vla.subgoal.finetuning.rows import Collator, RowDataset
+from mme_vla.subgoal.finetuning.rows import SETS, Collator, RowDataset
 from mme_vla.subgoal.models.qwen3vl import VLM, load_model
 
 if TYPE_CHECKING:
@@ -76,8 +76,8 @@ def accumulation(batch: int, per_device: int, processes: int) -> int:
     """Return the batches of a step, so that all processes together read `batch` rows."""
     rows_at_once = per_device * processes
     require(
-        batch % rows_at_once == 0,
-        f"batch={batch} is no multiple of per_device_batch={per_device} times {processes}"
+        min(batch, per_device) >= 1 and batch % rows_at_once == 0,
+        f"batch={batch} is no positive multiple of per_device_batch={per_device} times {processes}"
         " processes; choose numbers that divide.",
     )
     return batch // rows_at_once
@@ -114,8 +114,19 @@ def fine_tune(cfg: "DictConfig") -> Path:
     output = Path(cfg.output)
     checkpoint = find_checkpoint(output, cfg.resume)
     device = str(find_device(str(cfg.device)))
+    # A number below 1 would mean "no limit" to transformers.
+    require(
+        cfg.epochs > 0 and (cfg.steps is None or cfg.steps >= 1),
+        f"epochs={cfg.epochs} must be above 0, and steps={cfg.steps} 1 or more, or null.",
+    )
     set_seed(cfg.seed)
     model, processor = load_model(cfg.vlm, "bfloat16" if device != "cpu" else "float32")
+    rows = RowDataset(cfg.rows, processor.tokenizer, cfg.max_length)
+    if rows.left_out:
+        print(
+            f"Left out: {counted(rows.left_out, 'row')} of more than max_length={cfg.max_length}"
+            " tokens."
+        )
     lora = LoraConfig(
         r=cfg.lora.rank,
         lora_alpha=cfg.lora.alpha,
@@ -123,26 +134,24 @@ def fine_tune(cfg: "DictConfig") -> Path:
         target_modules=TARGETS,
         task_type="CAUSAL_LM",
     )
-    vlm = VLM(get_peft_model(model, lora), processor)
-    vlm.model.config.use_cache = False
-    rows = RowDataset(cfg.rows, processor.tokenizer, cfg.max_length)
-    if rows.left_out:
-        print(
-            f"Left out: {counted(rows.left_out, 'row')} of more than max_length={cfg.max_length}"
-            " tokens."
+    try:
+        vlm = VLM(get_peft_model(model, lora), processor)
+        vlm.model.config.use_cache = False
+        trainer = Trainer(
+            model=vlm.model,
+            args=_arguments(cfg, output, device),
+            train_dataset=rows,
+            data_collator=Collator(vlm),
         )
-    trainer = Trainer(
-        model=vlm.model,
-        args=_arguments(cfg, output, device),
-        train_dataset=rows,
-        data_collator=Collator(vlm),
-    )
+    except (ImportError, ValueError) as error:  # such as a missing package deepspeed
+        raise UserError(f"The settings of the training do not work: {error}") from None
     trainer.train(resume_from_checkpoint=checkpoint)
     if trainer.is_world_process_zero():
         vlm.model.save_pretrained(output / ADAPTER)
+        name, kind = SETS.get(Path(cfg.rows).stem, SETS["grounded"])
         print(
-            f"{output / ADAPTER}: subgoal=qwenvl subgoal.adapter={output / ADAPTER} predicts"
-            " with it."
+            f"{output / ADAPTER}: subgoal={name} subgoal.kind={kind}"
+            f" subgoal.adapter={output / ADAPTER} predicts with it."
         )
     return output / ADAPTER
 

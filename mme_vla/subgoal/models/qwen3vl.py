@@ -2,6 +2,7 @@
 in batches.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, did_you_mean, missing_extra, require
+from mme_vla.errors import UserError, brief, did_you_mean, missing_extra, require
 from mme_vla.policy.tensor_files import check_transformers_folder
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip
 from mme_vla.subgoal.models.replies import Reply
@@ -107,10 +108,14 @@ class VLM:
 
             check_transformers_folder(adapter)
             try:
-                model = PeftModel.from_pretrained(model, adapter).merge_and_unload()
-            except (OSError, ValueError) as error:
+                with warnings.catch_warnings():
+                    # Layers that the adapter lacks would stay as they are.
+                    warnings.filterwarnings("error", "Found missing adapter keys")
+                    model = PeftModel.from_pretrained(model, adapter).merge_and_unload()
+            except (OSError, ValueError, RuntimeError, UserWarning) as error:
                 raise UserError(
-                    f"subgoal.adapter={adapter!r} is no LoRA adapter of {name!r}: {error}"
+                    f"subgoal.adapter={adapter!r} is no LoRA adapter of {name!r}:"
+                    f" {brief(str(error), 500, quote=False)}"
                 ) from None
         return cls(model.to(where).eval(), processor, batch_size)
 
