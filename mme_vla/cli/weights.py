@@ -176,9 +176,11 @@ def convert(
     trees = [] if config_dir is None else [Path(config_dir).resolve()]
     policy = _policy(opened, overrides, trees, trust_plugins)
     check_target(policy, to)
-    stats = None
-    if not dry_run:
-        stats = read_stats(opened.folder, asset)
+    if dry_run:
+        read_as(policy, opened)
+        print_mapping(policy, opened, to)
+        return
+    stats = read_stats(opened.folder, asset)
     is_relative = bool(policy.embodiment.action.relative)
     if (
         stats is not None
@@ -194,9 +196,6 @@ def convert(
             stacklevel=2,
         )
     tensors = read_as(policy, opened)
-    if dry_run:
-        print_mapping(policy, opened, to)
-        return
     if to == "ours" and policy.processor is None:
         from mme_vla.policy.build import build_processor
 

@@ -24,13 +24,11 @@ class SubgoalHistory:
     entries: list[str] = field(default_factory=list)
     points: list[Point] = field(default_factory=list)
 
-    def add(self, entry: str, points: Sequence[Point] = ()) -> bool:
-        """Add a subgoal unless it repeats the last one; return whether it was added."""
-        if self.entries and self.entries[-1] == entry:
-            return False
-        self.entries.append(entry)
-        self.points.extend(points)
-        return True
+    def add(self, entry: str, points: Sequence[Point] = ()) -> None:
+        """Add a subgoal unless it repeats the last one."""
+        if not self.entries or self.entries[-1] != entry:
+            self.entries.append(entry)
+            self.points.extend(points)
 
 
 def hold_until(task: str, last: str | None) -> int:

@@ -163,9 +163,8 @@ class OpenAI(PromptedPredictor):
         require(wait >= 0, f"wait={wait} must be a number of steps, 0 or more.")
         self.wait = wait
 
-    def due(self, episode: SubgoalEpisode) -> bool:
+    def due(self, episode: Any) -> bool:
         """Return whether to ask now; a failed question is repeated at the next opportunity."""
-        assert isinstance(episode, ConversationEpisode)
         if episode.again or episode.query_step is None:
             return True
         if episode.task in LATE and self.due_step(episode) < self.wait:

@@ -3,7 +3,7 @@ supply.
 """
 
 from mme_vla.weights.load import load_weights, start_from, transfer
-from mme_vla.weights.source import detect_format, open_source
+from mme_vla.weights.source import open_source
 from mme_vla.weights.statistics import read_stats
 
-__all__ = ["detect_format", "load_weights", "open_source", "read_stats", "start_from", "transfer"]
+__all__ = ["load_weights", "open_source", "read_stats", "start_from", "transfer"]

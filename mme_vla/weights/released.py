@@ -16,9 +16,7 @@ from mme_vla.errors import UserError, listed
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.weights.tables import (
     Adapter,
-    Derived,
     NameTable,
-    Unread,
     memory_parameters,
     pi05_of,
     prefixed,
@@ -29,12 +27,8 @@ OF_MEMORY = r"(^|/)mem_|_mem(/|$)"
 
 
 def released_adapter(policy: MMEPolicy) -> Adapter:
-    return Adapter(
-        released_table(policy),
-        released_unread(policy),
-        derived=released_derived(policy),
-        of_memory=OF_MEMORY,
-    )
+    """The released tree, where it has names for the whole policy."""
+    return _adapter(policy, released_table(policy))
 
 
 def partial_adapter(policy: Any) -> Adapter:
@@ -46,9 +40,14 @@ def partial_adapter(policy: Any) -> Adapter:
     for name, pieces in _table(policy).items():
         if name in state or policy.finetune_spec.component_of(name) != "memory":
             known[name] = pieces
-    return Adapter(
-        known, released_unread(policy), derived=released_derived(policy), of_memory=OF_MEMORY
-    )
+    return _adapter(policy, known)
+
+
+def _adapter(policy: MMEPolicy, table: NameTable) -> Adapter:
+    unread = backbone_names.released_unread(pi05_of(policy))
+    unread += memory_names.released_unread(policy.memory)
+    derived = memory_names.released_derived(policy.memory)
+    return Adapter(table, unread, derived=derived, of_memory=OF_MEMORY)
 
 
 def released_table(policy: MMEPolicy) -> NameTable:
@@ -76,19 +75,6 @@ def _table(policy: MMEPolicy) -> NameTable:
     if policy.memory is None:
         return table
     return table | prefixed("memory", memory_names.released_names(policy.memory))
-
-
-def released_unread(policy: MMEPolicy) -> list[Unread]:
-    """Released leaves, or layers of them, that no action reads and this library does not hold."""
-    unread = backbone_names.released_unread(pi05_of(policy))
-    return unread + memory_names.released_unread(policy.memory)
-
-
-def released_derived(policy: MMEPolicy) -> list[Derived]:
-    """Released leaves that follow from the configuration: dropped when read, recomputed when
-    written.
-    """
-    return memory_names.released_derived(policy.memory)
 
 
 def to_released(policy: MMEPolicy) -> dict[str, Tensor]:

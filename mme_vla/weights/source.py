@@ -124,13 +124,6 @@ class Source:
             return {}
         return read_config(self.folder)
 
-    @property
-    def model(self) -> str | None:
-        """Our name of the variant a checkpoint is, or None where neither its files nor its tensors
-        tell one.
-        """
-        return self.variants[0] if len(self.variants) == 1 else None
-
     @cached_property
     def variants(self) -> list[str]:
         """Our names of the variants that a checkpoint may be; none where it does not say.
@@ -192,11 +185,6 @@ def _variants_with(leaves: Collection[str], variant: str) -> list[str]:
         perceptual = ["framesamp", "tokendrop"]
         memories = [name for name in perceptual if name in variant] or perceptual
     return [f"{memory}_{integration}" for memory in memories]
-
-
-def detect_format(source: str | Path) -> str:
-    """The key of `formats()` that `source` has."""
-    return open_source(source).format
 
 
 def open_source(
@@ -308,10 +296,9 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         ):
             names += list(opened.keys())
     if is_port(names):
-        if "type" in Source("lerobot", folder).config:
-            return Source("lerobot", folder, files)
         is_prefixed = any(name.startswith(LEROBOT_PREFIX) for name in names)
-        return Source("lerobot" if is_prefixed else "openpi", folder, files)
+        is_lerobot = is_prefixed or "type" in Source("lerobot", folder).config
+        return Source("lerobot" if is_lerobot else "openpi", folder, files)
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
     if "backbone" in Source("ours", folder).config:
         return Source("ours", folder, files)

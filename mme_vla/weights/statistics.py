@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.tensor_files import read_safetensors
+from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import checked_file, read_json
 from mme_vla.weights.source import method_formats
@@ -41,10 +42,9 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
                 f"{folder} holds statistics of {listed(files) or 'no dataset'}: {reason}"
             )
         return NormStats.load(_local_file(folder, files[asset]))
-    if (folder / "norm_stats.json").is_file():
-        files[""] = folder / "norm_stats.json"
-    if files:
-        return NormStats.load(_local_file(folder, next(iter(files.values()))))
+    for file in (*files.values(), folder / STATS_FILE):
+        if file.is_file():
+            return NormStats.load(_local_file(folder, file))
     for fmt in method_formats().values():
         if fmt.stats is not None and (stats := fmt.function("stats")(folder)) is not None:
             return stats

@@ -98,25 +98,13 @@ def linear(path: str, *, layer: int | None = None) -> NameTable:
     return {"weight": [kernel], "bias": [bias]}
 
 
-def paths_of(table: NameTable) -> set[str]:
-    """The foreign names of a table."""
-    paths = set()
-    for pieces in table.values():
-        paths |= {piece.path for piece in pieces}
-    return paths
-
-
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Translate a foreign checkpoint, which has all names of the table, into our names and
-    layouts.
+    """Translate a foreign checkpoint, which has all names of the table in their shapes, into our
+    names and layouts.
     """
     target = {}
     for name, pieces in table.items():
-        try:
-            parts = [piece.to_target(source[piece.path]) for piece in pieces]
-        except (RuntimeError, IndexError, ValueError) as error:
-            shapes = {piece.path: tuple(source[piece.path].shape) for piece in pieces}
-            raise UserError(f"{name} cannot be made of {shapes}: {error}") from error
+        parts = [piece.to_target(source[piece.path]) for piece in pieces]
         target[name] = torch.cat(parts) if len(parts) > 1 else parts[0].contiguous()
     return target
 
@@ -180,7 +168,10 @@ class Adapter:
 
     def needed(self) -> set[str]:
         """Foreign names without which the policy cannot be filled."""
-        return paths_of(self.table)
+        paths = set()
+        for pieces in self.table.values():
+            paths |= {piece.path for piece in pieces}
+        return paths
 
     def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Write our tensors in the foreign names and layouts, the three lists included."""
@@ -208,11 +199,9 @@ class Adapter:
     ) -> dict[str, Tensor]:
         """Read foreign tensors into our names; `target` gives the shapes they must have."""
         self.check_fit(released, target, source)
-        tensors = dict(released)
         for constant in self.derived:
             if constant.path not in released:
                 continue
-            tensors.pop(constant.path, None)
             # What a checkpoint stores of them must be what this configuration gives.
             stored = released[constant.path].real.float().cpu()
             expected = constant.make().real.float().cpu()
@@ -225,7 +214,7 @@ class Adapter:
                     f" this configuration gives {tuple(expected.shape)}: it was trained with other"
                     " sizes or rates; set the same here."
                 )
-        return read(self.table, tensors)
+        return read(self.table, released)
 
     def check_fit(
         self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str

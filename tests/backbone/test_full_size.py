@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 
 from mme_vla import Policy, build_policy
-from mme_vla.weights.released import released_derived, released_table, released_unread
+from mme_vla.weights.released import released_adapter, released_table
 from mme_vla.weights.tables import write
 
 VARIANTS = {
@@ -43,7 +43,8 @@ def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
     assert set(table) == set(state), (
         "every tensor of ours has a released place, and no place is invented"
     )
-    exported = write(table, released_unread(policy), state, released_derived(policy))
+    adapter = released_adapter(policy)
+    exported = write(table, adapter.unread, state, adapter.derived)
     assert {k: tuple(v.shape) for k, v in exported.items()} == {
         k: tuple(v["shape"]) for k, v in tree["params"].items()
     }
@@ -55,8 +56,9 @@ def test_parameter_count_is_the_released_one_less_unread_and_derived(variant: st
         VARIANTS[variant]
     ]
     policy = full_size(variant)
-    unread = sum(math.prod(gap.shape) for gap in released_unread(policy))
-    derived = sum(constant.make().numel() for constant in released_derived(policy))
+    adapter = released_adapter(policy)
+    unread = sum(math.prod(gap.shape) for gap in adapter.unread)
+    derived = sum(constant.make().numel() for constant in adapter.derived)
     assert (
         sum(p.numel() for p in policy.parameters())
         == summary["total_parameters"] - unread - derived

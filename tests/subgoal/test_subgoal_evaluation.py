@@ -331,3 +331,21 @@ def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(
         assert pick["text"] == pick["oracle"] and len(pick["points"]) == 1
     else:
         assert score.asked == 3, "ButtonUnmask holds its first subgoal only once there is one"
+
+
+def test_an_error_in_the_background_is_raised_once_and_the_next_question_is_answered() -> None:
+    class Interrupted(SubgoalPredictor):
+        broken = True
+
+        def predict_due(self, episodes):
+            if self.broken:
+                self.broken = False
+                raise UserError("the key is not accepted")
+            return [Subgoal("go", queried=True) for _ in episodes]
+
+    predictor = BackgroundPredictor(Interrupted())
+    episode = predictor.start_episode("a")
+    episode.observe(np.zeros((1, 8, 8, 3), np.uint8))
+    with pytest.raises(UserError, match="key"):
+        predictor.predict([episode])
+    assert predictor.predict([episode]) == [Subgoal("go", queried=True)]

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from safetensors.torch import load_file, save_file
 
 from helpers import subgoal_fakes
 from mme_vla.errors import UserError
@@ -310,3 +311,20 @@ def test_an_episode_that_is_joined_late_is_queried_at_once():
 def test_options_of_a_model_that_cannot_work_are_named(options, named):
     with pytest.raises(UserError, match=named):
         build_predictor({"name": "qwenvl", "model": "tiny", "device": "cpu", **options})
+
+
+@pytest.mark.parametrize("damage", ["shapes", "names"])
+def test_an_adapter_of_another_model_is_refused_and_never_left_out(damage, tmp_path):
+    peft = pytest.importorskip("peft", reason="needs the extra vlm")
+    model, _ = make_tiny()
+    lora = peft.LoraConfig(r=2, target_modules=["q_proj"], task_type="CAUSAL_LM")
+    peft.get_peft_model(model, lora).save_pretrained(tmp_path)
+    file = tmp_path / "adapter_model.safetensors"
+    tensors = {}
+    for name, tensor in load_file(file).items():
+        if damage == "names":
+            name = name.replace("language_model", "text_model")
+        tensors[name] = tensor[:, :1].contiguous() if damage == "shapes" else tensor
+    save_file(tensors, file)
+    with pytest.raises(UserError, match="is no LoRA adapter of 'tiny'"):
+        VLM.load("tiny", str(tmp_path), device="cpu")

@@ -216,3 +216,16 @@ def test_answers_that_python_itself_cannot_read_are_malformed(read):
 def test_numbers_too_long_for_a_point_are_no_point():
     text = f"pick at <{DIGITS}, 1>"
     assert mark_points(text) == (text, [])
+
+
+def test_escapes_of_json_in_a_reply_are_decoded():
+    reply = '{"subgoal": "pick up the \\"red\\" cube at \\u003c500, 250\\u003e"}'
+    assert parse_gemini(reply) == 'pick up the "red" cube at <500, 250>'
+    assert pixels_of_pairs(parse_gemini(reply)).points == ((128, 64),)
+    assert parse_gemini(r'{"subgoal": "press \d"}') == r"press \d"
+
+
+@pytest.mark.parametrize("mark", ["<bbox>", "<image>", "<video>"])
+def test_a_reply_that_holds_a_mark_of_questions_is_malformed(mark):
+    with pytest.raises(MalformedReply, match="mark of questions"):
+        parse_subgoal(f"pick up the cube at {mark}")

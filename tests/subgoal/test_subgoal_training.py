@@ -212,7 +212,7 @@ def test_the_effective_batch_is_what_was_requested():
     assert (
         accumulation(64, 4, 4) == 4 and accumulation(48, 4, 4) == 3 and accumulation(64, 4, 1) == 16
     )
-    with pytest.raises(UserError, match="no multiple"):
+    with pytest.raises(UserError, match="no positive multiple"):
         accumulation(64, 4, 3)
     recipe = compose("subgoal_train", ["rows=x"])
     assert (
@@ -230,3 +230,33 @@ def test_the_effective_batch_is_what_was_requested():
         2,
         0.05,
     )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"per_device_batch": 0}, "no positive multiple of per_device_batch=0"),
+        ({"batch": 0}, "batch=0 is no positive multiple"),
+        ({"steps": -3}, "steps=-3 1 or more"),
+        ({"steps": "null", "epochs": 0}, "epochs=0 must be above 0"),
+        ({"lora.rank": 0}, "settings of the training do not work.* 0"),
+        ({"lora.dropout": 2}, "settings of the training do not work.* 2"),
+        ({"report_to": "tensorbord"}, "tensorbord is not supported"),
+    ],
+)
+def test_settings_of_a_training_that_cannot_work_are_named(data, tmp_path, words, message):
+    with pytest.raises(UserError, match=message):
+        fine_tune(settings(data, tmp_path / "run", **words))
+
+
+@pytest.mark.parametrize(
+    ("rows", "use"),
+    [
+        ("memer", "subgoal=memer subgoal.kind=grounded"),
+        ("simple", "subgoal=qwenvl subgoal.kind=simple"),
+    ],
+)
+def test_the_end_of_a_training_names_the_predictor_of_its_rows(data, tmp_path, capsys, rows, use):
+    output = tmp_path / "run"
+    fine_tune(settings(data, output, rows=data / f"{rows}.jsonl", steps=1))
+    assert f"{use} subgoal.adapter={output / 'adapter'}" in capsys.readouterr().out

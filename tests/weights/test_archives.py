@@ -17,7 +17,9 @@ from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy, unit_stats
 from mme_vla.training.runs import start_from
 from mme_vla.weights import load_weights
+from mme_vla.weights.orbax import Zipped
 from mme_vla.weights.source import open_source
+from mme_vla.weights.statistics import stats_files
 
 pytest.importorskip("tensorstore", reason="reading Orbax checkpoints needs the extra 'orbax'")
 VARIANT = "perceptual-tokendrop-modul"
@@ -58,7 +60,7 @@ def test_an_archive_is_loaded_completely_with_its_statistics(
 def test_the_variant_is_recognised_from_the_name_of_the_folder(
     policy: MMEPolicy, published: Path, tmp_path: Path
 ) -> None:
-    assert open_source(published / "79999.zip").model == "tokendrop_modul"
+    assert open_source(published / "79999.zip").variants == ["tokendrop_modul"]
     convert(published, tmp_path / "ours", ["backbone=tiny"])
     assert same(MMEPolicy.from_pretrained(tmp_path / "ours"), policy)
 
@@ -68,10 +70,10 @@ def test_a_file_in_the_archive_tells_it_before_the_folder_does(
 ) -> None:
     archive = tmp_path / "79999.zip"
     archive.write_bytes((published / "79999.zip").read_bytes())
-    assert open_source(archive).model is None
+    assert open_source(archive).variants == []
     with zipfile.ZipFile(archive, "a") as opened:
         opened.writestr("history_config.txt", "configs/recurrent-ttt-expert.yaml\n")
-    assert open_source(archive).model == "ttt_expert"
+    assert open_source(archive).variants == ["ttt_expert"]
 
 
 def test_a_folder_on_the_hub_is_fetched_alone(
@@ -166,3 +168,30 @@ def test_many_small_files_that_unpack_to_more_than_arrays_do_are_refused(tmp_pat
     pieces = {f"params/d/{i}": bytes(4_000_000) for i in range(3)}
     with pytest.raises(UserError, match="bytes unpack to 12,000,001: that is no checkpoint"):
         open_source(write(tmp_path / "1.zip", **{"params/manifest.ocdbt": b"x"}, **pieces))
+
+
+def test_of_several_steps_in_an_archive_the_newest_is_read_with_its_own_statistics(
+    tmp_path: Path,
+) -> None:
+    contents = {}
+    for step in (9999, 10000, 100):
+        for place in ("org/robot", "other/robot"):
+            contents[f"run/{step}/assets/{place}/norm_stats.json"] = f"{step} {place}".encode()
+        contents[f"run/{step}/params/manifest.ocdbt"] = b"x"
+    contents["run/history_config.txt"] = b"recurrent-ttt-expert.yaml"
+    source = open_source(write(tmp_path / "1.zip", **contents))
+    assert isinstance(source.params, Zipped) and source.params.place == "run/10000/params/"
+    assert source.variants == ["ttt_expert"]
+    files = stats_files(source.folder)
+    assert {name: file.read_text() for name, file in files.items()} == {
+        "org/robot": "10000 org/robot",
+        "other/robot": "10000 other/robot",
+    }
+
+
+def test_an_archive_that_was_refused_is_refused_again(tmp_path: Path) -> None:
+    names = ["params/manifest.ocdbt", "assets/a b/norm_stats.json"]
+    file = write(tmp_path / "1.zip", **dict.fromkeys(names, b"{}"))
+    for _ in range(2):
+        with pytest.raises(UserError, match="cannot name a folder"):
+            open_source(file)

@@ -57,7 +57,6 @@ def test_an_unknown_name_is_recognised_by_the_tensors(
     write_orbax({leaf: torch.zeros(1) for leaf in leaves}, tmp_path / "29999" / "params")
     source = open_source(name(tmp_path, word))
     assert source.variants == variants and not source.lacks_positions
-    assert source.model == (variants[0] if len(variants) == 1 else None)
 
 
 def test_a_run_without_positions_becomes_a_memory_without_positions(

@@ -14,7 +14,7 @@ import torch
 from helpers import golden
 from mme_vla import UserError
 from mme_vla.testing.small import small_policy
-from mme_vla.weights import detect_format, load_weights, open_source, read_stats
+from mme_vla.weights import load_weights, open_source, read_stats
 from mme_vla.weights.orbax import read_orbax, write_orbax
 
 pytest.importorskip("tensorstore", reason="reading Orbax checkpoints needs the extra 'orbax'")
@@ -61,9 +61,9 @@ def test_a_pipe_in_the_place_of_a_part_is_refused_and_not_waited_for(tmp_path: P
 @pytest.mark.parametrize("place", [RUN, RUN / "100", RUN / "100" / "params"])
 def test_run_step_and_arrays_are_the_same_source(place: Path) -> None:
     source = open_source(place)
-    assert detect_format(place) == "released"
+    assert open_source(place).format == "released"
     assert source.params == RUN / "100" / "params"
-    assert source.model == "tokendrop_modul"
+    assert source.variants == ["tokendrop_modul"]
     stats = read_stats(source.folder)
     assert stats is not None
     assert stats.actions.q99[1] == 1.5

@@ -17,7 +17,7 @@ from mme_vla import UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch, small_policy
-from mme_vla.weights import detect_format, load_weights
+from mme_vla.weights import load_weights, open_source
 from mme_vla.weights.ports import to_lerobot, to_openpi
 
 EMBEDDING = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
@@ -89,13 +89,13 @@ def test_every_spelling_loads_the_same_policy(
 
 def test_format_is_recognised_from_names_and_config(pi05: MMEPolicy, tmp_path: Path) -> None:
     assert (
-        detect_format(saved(to_lerobot(pi05, pi05.state_dict()), tmp_path / "prefixed"))
+        open_source(saved(to_lerobot(pi05, pi05.state_dict()), tmp_path / "prefixed")).format
         == "lerobot"
     )
     bare = saved(to_openpi(pi05, pi05.state_dict()), tmp_path / "bare")
-    assert detect_format(bare) == "openpi"
+    assert open_source(bare).format == "openpi"
     (bare / "config.json").write_text('{"type": "pi05"}')
-    assert detect_format(bare) == "lerobot"
+    assert open_source(bare).format == "lerobot"
 
 
 def test_bfloat16_becomes_float32_masters_or_stays(pi05: MMEPolicy, tmp_path: Path) -> None:

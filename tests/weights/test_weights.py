@@ -5,6 +5,7 @@ foreign weights.
 import json
 import re
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from helpers.memory_fakes import same
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli.weights import convert, main
 from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
+from mme_vla.utils import write_json
 from mme_vla.weights import (
-    detect_format,
     load_weights,
     open_source,
     read_stats,
@@ -51,7 +52,7 @@ def base(bases: dict[str, Path]) -> MMEPolicy:
 def test_every_format_is_reported_and_fills_a_policy_on_meta(
     fmt: str, bases: dict[str, Path], base: MMEPolicy
 ) -> None:
-    assert detect_format(bases[fmt]) == fmt
+    assert open_source(bases[fmt]).format == fmt
     loaded = load_weights(build_policy("pi05", device="meta"), bases[fmt])
     assert same(loaded, base)
     assert all(p.requires_grad for p in loaded.parameters())
@@ -117,7 +118,9 @@ def test_a_start_never_hides_what_is_missing(bases: dict[str, Path], tmp_path: P
         start_from(build_policy("framesamp_modul", device="meta"), bases["ours"])
 
 
-def test_another_tokenizer_is_not_a_start(bases: dict[str, Path], tmp_path: Path) -> None:
+def test_another_tokenizer_is_no_start_and_is_not_loaded(
+    bases: dict[str, Path], tmp_path: Path
+) -> None:
     MMEPolicy.from_pretrained(bases["ours"]).save_pretrained(tmp_path)
     about = json.loads((tmp_path / "processor.json").read_text())
     (tmp_path / "processor.json").write_text(
@@ -126,6 +129,8 @@ def test_another_tokenizer_is_not_a_start(bases: dict[str, Path], tmp_path: Path
     (tmp_path / "SHA256SUMS").unlink()
     with pytest.raises(UserError, match="another tokenizer"):
         start_from(build_policy("framesamp_modul"), tmp_path)
+    with pytest.raises(UserError, match="another tokenizer"):
+        load_weights(build_policy("pi05"), tmp_path)
 
 
 @pytest.mark.slow
@@ -303,3 +308,44 @@ def test_statistics_of_a_lerobot_processor_come_from_the_file_its_json_names(
     (tmp_path / file).unlink()
     with pytest.raises(UserError, match="normalizer_processor"):
         read_stats(tmp_path)
+
+
+def test_a_released_run_is_named_after_its_parts_whatever_the_model_is_called(
+    tmp_path: Path,
+) -> None:
+    policy = build_policy("framesamp_modul", memory="tokendrop")
+    policy.save_pretrained(tmp_path / "ours")
+    convert(tmp_path / "ours", tmp_path / "released", to="released")
+    assert open_source(tmp_path / "released").variants == ["tokendrop_modul"]
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_lerobots_statistics_of_absolute_actions_are_left_out_with_a_warning(
+    relative: bool, bases: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / "lerobot"
+    shutil.copytree(bases["lerobot"], folder)
+    (folder / "norm_stats.json").unlink()
+    about = json.loads((folder / "config.json").read_text())
+    write_json(folder / "config.json", {**about, "use_relative_actions": relative})
+    step = {"registry_name": "normalizer_processor", "state_file": "stats.safetensors"}
+    write_json(folder / "policy_preprocessor.json", {"steps": [step]})
+    stats = unit_stats()
+    tensors = {}
+    for feature, values in (("observation.state", stats.state), ("action", stats.actions)):
+        for key, value in values.to_dict().items():
+            tensors[f"{feature}.{key}"] = torch.tensor(value)
+    save_file(tensors, folder / "stats.safetensors")
+    caught = nullcontext() if relative else pytest.warns(UserWarning, match="absolute actions")
+    with caught:
+        convert(folder, tmp_path / "ours", ["backbone=tiny"])
+    taken = MMEPolicy.from_pretrained(tmp_path / "ours").require_processor().stats
+    assert (taken is not None) == relative
+
+
+def test_a_choice_between_statistics_is_asked_for_before_the_weights_are_read(
+    bases: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mme_vla.cli.weights.read_as", lambda *_: pytest.fail("read"))
+    with pytest.raises(UserError, match="none of 'droid'"):
+        convert(bases["openpi"], tmp_path / "ours", ["backbone=tiny"], asset="droid")

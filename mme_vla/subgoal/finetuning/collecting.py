@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -92,10 +91,9 @@ def build(
     episodes: Sequence[Demonstration],
     output: Path,
     sets: Sequence[str],
-    options: RowOptions | None = None,
+    options: RowOptions,
 ) -> dict[str, int]:
     """Build these sets; return the number of rows of each."""
-    options = options or RowOptions()
     require(
         episodes and sets,
         "There is nothing to build: name at least one episode and one of the sets.",
@@ -110,52 +108,44 @@ def build(
         origins[episode.name] = episode.origin
     plan = to_json({"sets": list(sets), "options": asdict(options), "episodes": origins})
     with FolderLock(output, "build of subgoal data"):
-        return _build(episodes, output, sets, options, plan)
+        require(
+            claim_plan(output, plan),
+            f"{output} holds something else, or the result of other inputs, sets or options. Choose"
+            " another output, repeat that command to finish it, or remove the folder yourself.",
+        )
+        # An interrupted run may have left unfinished files.
+        remove_drafts(output)
+        for path in output.rglob("*"):
+            if path.is_dir():
+                remove_drafts(path)
 
+        rows_files = {name: output / f"{name}.jsonl" for name in sets}
+        if not all(path.is_file() for path in rows_files.values()):
+            missing = []
+            for episode in episodes:
+                if not all(_part(output, name, episode).is_file() for name in sets):
+                    missing.append(episode)
+            n_built = len(episodes) - len(missing)
+            with progress("subgoal data", len(episodes), n_built, "episodes") as advance:
+                for episode in missing:
+                    _build_episode(episode, output, sets, options)
+                    advance(1)
+            for name, path in rows_files.items():
+                with write_atomically(path) as draft, draft.open("w", encoding="utf-8") as file:
+                    for episode in episodes:
+                        file.write(_part(output, name, episode).read_text(encoding="utf-8"))
+        shutil.rmtree(output / PARTS, ignore_errors=True)
 
-def _build(
-    episodes: Sequence[Demonstration],
-    output: Path,
-    sets: Sequence[str],
-    options: RowOptions,
-    plan: dict[str, Any],
-) -> dict[str, int]:
-    require(
-        claim_plan(output, plan),
-        f"{output} holds something else, or the result of other inputs, sets or options. Choose"
-        " another output, repeat that command to finish it, or remove the folder yourself.",
-    )
-    # An interrupted run may have left unfinished files.
-    remove_drafts(output)
-    for path in output.rglob("*"):
-        if path.is_dir():
-            remove_drafts(path)
-
-    rows_files = {name: output / f"{name}.jsonl" for name in sets}
-    if not all(path.is_file() for path in rows_files.values()):
-        missing = []
-        for episode in episodes:
-            if not all(_part(output, name, episode).is_file() for name in sets):
-                missing.append(episode)
-        n_built = len(episodes) - len(missing)
-        with progress("subgoal data", len(episodes), n_built, "episodes") as advance:
-            for episode in missing:
-                _build_episode(episode, output, sets, options)
-                advance(1)
-        for name, path in rows_files.items():
-            with write_atomically(path) as draft, draft.open("w", encoding="utf-8") as file:
-                for episode in episodes:
-                    file.write(_part(output, name, episode).read_text(encoding="utf-8"))
-    shutil.rmtree(output / PARTS, ignore_errors=True)
-
-    # The checksums are written last: a file that they do not list is not compared.
-    if not (output / SUMS).is_file():
-        files = []
-        for path in output.rglob("*.*"):
-            if path.suffix in (".jsonl", ".png", ".mp4"):
-                files.append(str(path.relative_to(output)))
-        write_sums(output, files)
-    return {name: path.read_text(encoding="utf-8").count("\n") for name, path in rows_files.items()}
+        # The checksums are written last: a file that they do not list is not compared.
+        if not (output / SUMS).is_file():
+            files = []
+            for path in output.rglob("*.*"):
+                if path.suffix in (".jsonl", ".png", ".mp4"):
+                    files.append(str(path.relative_to(output)))
+            write_sums(output, files)
+        return {
+            name: path.read_text(encoding="utf-8").count("\n") for name, path in rows_files.items()
+        }
 
 
 def _build_episode(

@@ -85,8 +85,9 @@ def accumulation(batch: int, per_device: int, processes: int) -> int:
 
 def find_checkpoint(output: Path, resume: str | None) -> str | None:
     """Return the checkpoint to continue from; None for a new run."""
-    checkpoints = list(output.glob("checkpoint-*"))
-    checkpoints.sort(key=lambda path: int(path.name.split("-")[-1]))
+    checkpoints = sorted(
+        output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1])
+    )
     if resume is None:
         if checkpoints or (output / ADAPTER).exists():
             raise UserError(

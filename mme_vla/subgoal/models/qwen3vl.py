@@ -70,7 +70,6 @@ class VLM:
     """
 
     def __init__(self, model: Any, processor: Any, batch_size: int = 8) -> None:
-        _check_batch(batch_size)
         self.model = model
         self.processor = processor
         self.batch_size = batch_size
@@ -100,7 +99,10 @@ class VLM:
             device: `auto` (a GPU where there is one), `cpu`, `cuda`, `cuda:1`, …
             dtype: of the weights, one of `DTYPES`.
         """
-        _check_batch(batch_size)
+        require(
+            isinstance(batch_size, int) and batch_size >= 1,
+            f"batch_size={batch_size!r} must be a whole number, 1 or more.",
+        )
         where = find_device(device)  # before the minutes that loading may take
         model, processor = load_model(name, dtype)
         if adapter is not None:
@@ -196,10 +198,3 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
         first_line = str(error).splitlines()[0]
         raise UserError(f"No Qwen3-VL model {name!r} in {source}: {first_line}") from None
     return model, processor
-
-
-def _check_batch(size: int) -> None:
-    require(
-        isinstance(size, int) and size >= 1,
-        f"batch_size={size!r} must be a whole number, 1 or more.",
-    )

@@ -12,7 +12,7 @@ from mme_vla.extras.methods.memoryvla.weights import memoryvla_adapter
 from mme_vla.extras.methods.openvla_oft.weights import VLA, openvla_adapter
 from mme_vla.policy.base import Policy
 from mme_vla.weights.load import load_weights, transfer
-from mme_vla.weights.source import detect_format
+from mme_vla.weights.source import open_source
 from mme_vla.weights.writers import check_target, write_policy
 
 
@@ -26,7 +26,7 @@ def test_a_checkpoint_is_saved_by_components_and_read_again(tmp_path: Path) -> N
     # as CogACT's hold
     model["action_model"]["net.history_embedder.linear.weight"] = torch.zeros(2, 2)
     torch.save({"model": model}, file)
-    assert detect_format(file) == "memoryvla"
+    assert open_source(file).format == "memoryvla"
     load_weights(other, file)
     assert same(policy, other)
 

@@ -14,7 +14,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import apply_finetuning, merge_adapters
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.load import load_weights, transfer
-from mme_vla.weights.source import detect_format
+from mme_vla.weights.source import open_source
 from mme_vla.weights.writers import check_target, write_policy
 
 
@@ -33,7 +33,7 @@ def saved(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
 def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) -> None:
     policy = built()
     folder = saved(policy, tmp_path / "run")
-    assert detect_format(folder) == "openvla"
+    assert open_source(folder).format == "openvla"
     names = set(load_file(folder / "model.safetensors"))
     assert {
         "vision_backbone.featurizer.blocks.0.ls1.scale_factor",

@@ -27,7 +27,7 @@ from mme_vla.extras.methods.sam2act.weights import (
 )
 from mme_vla.policy.build import build_policy
 from mme_vla.weights.load import load_weights
-from mme_vla.weights.source import detect_format
+from mme_vla.weights.source import open_source
 
 FULL = {
     "encoder.vision": 69_106_816 + 637_952,
@@ -110,7 +110,7 @@ def file(policy: SAM2ActPolicy, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def test_a_file_in_the_authors_layout_comes_back_completely(
     policy: SAM2ActPolicy, file: Path
 ) -> None:
-    assert detect_format(file) == "sam2act_plus"
+    assert open_source(file).format == "sam2act_plus"
     assert same(load_weights(build_policy("sam2act_plus", seed=1), file), policy)
 
 

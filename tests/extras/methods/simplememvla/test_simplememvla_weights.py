@@ -18,7 +18,7 @@ from mme_vla.extras.methods.simplememvla.weights import PublishedConfig
 from mme_vla.policy.base import Policy
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.load import load_weights, transfer
-from mme_vla.weights.source import detect_format
+from mme_vla.weights.source import open_source
 from mme_vla.weights.statistics import read_stats
 from mme_vla.weights.writers import write_policy
 
@@ -40,7 +40,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_published_folder_is_written_and_read_again(published: Path, tmp_path: Path) -> None:
-    assert detect_format(published) == "simplememvla"
+    assert open_source(published).format == "simplememvla"
     tensors = load_file(published / "model.safetensors")
     assert torch.equal(
         tensors[LM_HEAD], tensors["backbone.model.language_model.embed_tokens.weight"]
