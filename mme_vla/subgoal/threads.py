@@ -22,7 +22,7 @@ def start[T](call: Callable[[], T]) -> Future[T]:
 
 
 def side_by_side[A, T](call: Callable[[A], T], items: Sequence[A], workers: int) -> list[T]:
-    """Call with each of one or more items, `workers` at a time; return the results in the items' order.
+    """Call with each of one or more items, `workers` at a time; results in the items' order.
 
     Raises:
         Exception: of the first item that failed. No further call begins then.
