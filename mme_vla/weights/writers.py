@@ -224,7 +224,7 @@ def write_released(
     policy = mme_of(policy, "The released layout")
     sections = PolicySections.of(policy.config)
     name = str(sections.name)
-    if policy.memory is not None:  # its parts may be others than those that the name stands for
+    if policy.memory is not None:  # its parts may be others than the name says
         integration = sections.integration["name"].replace("modulator", "modul")
         name = f"{sections.memory['name']}_{integration}"
     for variant, target in VARIANTS.items():

@@ -315,7 +315,7 @@ def test_settings_that_cannot_work_are_named(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_points_outside_the_image_are_moved_to_its_edge_without_noise_too():
+def test_points_outside_the_image_are_clipped_without_noise_too():
     labels = made_up(length=40, changes=(0,))
     labels.grounded[:] = ["at <-3, 300>"] * 40
     for row in episode_rows("grounded", labels, RowOptions(noise=None)).rows:

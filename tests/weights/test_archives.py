@@ -170,7 +170,7 @@ def test_many_small_files_that_unpack_to_more_than_arrays_do_are_refused(tmp_pat
         open_source(write(tmp_path / "1.zip", **{"params/manifest.ocdbt": b"x"}, **pieces))
 
 
-def test_of_several_steps_in_an_archive_the_newest_is_read_with_its_own_statistics(
+def test_of_several_steps_in_an_archive_the_newest_is_read_with_its_statistics(
     tmp_path: Path,
 ) -> None:
     contents = {}

@@ -343,7 +343,7 @@ def test_lerobots_statistics_of_absolute_actions_are_left_out_with_a_warning(
     assert (taken is not None) == relative
 
 
-def test_a_choice_between_statistics_is_asked_for_before_the_weights_are_read(
+def test_statistics_are_selected_before_the_weights_are_read(
     bases: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mme_vla.cli.weights.read_as", lambda *_: pytest.fail("read"))
