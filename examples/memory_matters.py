@@ -38,7 +38,7 @@ import torch
 from mme_vla import build_policy
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.config.composition import compose
-from mme_vla.evaluation.results.statistics import bootstrap
+from mme_vla.evaluation.results.statistics import percentiles, resampled_means
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
@@ -282,7 +282,8 @@ def plot(results: list[dict], path: Path) -> None:
                 y = row + 0.22 * (place - (len(policies) - 1) / 2)
                 kind = result["model"].rpartition("_")[2]
                 colour = INTEGRATIONS.get(kind, FAINT)
-                low, high = bootstrap({"": [np.array(result["errors"])[:, None]]})
+                errors = {"": [np.array(result["errors"])]}
+                low, high = percentiles(resampled_means(errors, 10_000, seed=0))
                 axes.plot([low, high], [y, y], color=colour, lw=1.6)
                 axes.plot(result["error"], y, "o", color=colour, ms=5)
         for kind, colour in INTEGRATIONS.items():

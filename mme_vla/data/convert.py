@@ -30,7 +30,7 @@ from mme_vla.data.hdf5 import (
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX, SIDE_FILE, parquet_files
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
-from mme_vla.errors import UserError, did_you_mean, listed, require
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.registry import SIDE_FILES
 from mme_vla.utils import (
     FolderLock,
@@ -362,7 +362,6 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
         tool[CHOICE_ACTIONS] = episode.choice_actions()
     frames = iter(episode)
     first = next(frames)  # an episode has at least one
-    still = set(CAMERAS)
     video = options.images == "video"
     encoder = RGBEncoderConfig(
         vcodec=options.codec, crf=options.crf, pix_fmt=options.pix_fmt, g=options.gop
@@ -381,7 +380,6 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
         encoder_queue_maxsize=episode.length + 1,
     )
     for step, frame in enumerate(chain([first], frames)):
-        still -= {name for name in still if (getattr(frame, name) != getattr(first, name)).any()}
         row: dict[str, Any] = {
             "image": frame.front,
             "wrist_image": frame.wrist,
@@ -398,12 +396,6 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
             for camera in CAMERAS:
                 row[f"{camera}{RENDERED_SUFFIX}"] = np.array([camera in frame.rendered])
         dataset.add_frame(_spelt(row, options))
-    if still and episode.length > 1 and episode.frames is None:
-        raise UserError(
-            f"{episode.ref.file} {episode.ref.group}: {listed(sorted(still))} has the same image"
-            f" at all {episode.length} steps, so that camera did not record. Record the episode"
-            " again, or leave it out (episodes=[…])."
-        )
     dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     for path in root.glob("videos/**/*.mp4"):

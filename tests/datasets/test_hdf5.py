@@ -155,17 +155,6 @@ def test_values_that_cannot_be_are_named_before_they_are_converted(
         convert(list_episodes([path]), tmp_path / "data", ConvertOptions(images="png"))
 
 
-@pytest.mark.parametrize("camera", ["front", "wrist"])
-def test_a_camera_that_shows_one_image_all_the_time_is_named(tmp_path: Path, camera: str) -> None:
-    path = tmp_path / "record_dataset_Alpha.h5"
-    write_file(path, [6])
-    with h5py.File(path, "r+") as file:
-        for t in range(6):
-            file[f"episode_0/timestep_{t}/obs/{camera}_rgb"][:] = 0
-    with pytest.raises(UserError, match=rf"episode_0: {camera} has the same image at all 6 steps"):
-        convert(list_episodes([path]), tmp_path / "data", ConvertOptions(images="png"))
-
-
 def test_an_episode_of_one_step_is_converted(tmp_path: Path) -> None:
     path = tmp_path / "record_dataset_Alpha.h5"
     write_file(path, [1], poses=True)
