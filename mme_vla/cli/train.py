@@ -53,11 +53,13 @@ def main(cfg: DictConfig) -> None:
     """Train from the beginning, or continue with a run that was interrupted."""
     begun = time.perf_counter()
     run = TrainRun.from_config(policy_config(cfg))
-    folder = Path(run.output)
+    folder = Path(run.output).absolute()
     named = True
     if HydraConfig.initialized():
-        folder = Path(HydraConfig.get().runtime.output_dir)
         named = any(word.startswith("output=") for word in HydraConfig.get().overrides.task)
+        if not named:
+            # a job of a sweep has a folder of its own
+            folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         if run.trainings == 1:
             train(run, folder, begun, named)

@@ -144,9 +144,11 @@ def tensorboard_tracker(
     folder: Path, config: Mapping[str, Any], first_step: int, flush_secs: int = 30
 ) -> GeneralTracker:
     """Event files in `tensorboard/` of the run folder: `tensorboard --logdir outputs`."""
-    # Of an interrupted run, TensorBoard drops the points that this one writes again.
-    purge = first_step + 1 if first_step else None
-    return TensorBoardTracker("tensorboard", folder, purge_step=purge, flush_secs=flush_secs)
+    # Of an interrupted run, be it before its first checkpoint, TensorBoard drops the points that
+    # this one writes again.
+    return TensorBoardTracker(
+        "tensorboard", folder, purge_step=first_step + 1, flush_secs=flush_secs
+    )
 
 
 @LOGGERS.register("wandb")
@@ -300,7 +302,6 @@ def open_loggers(
     folder.mkdir(parents=True, exist_ok=True)
     tracker = None
     if section:
-        check_logger(section)
         tracker = LOGGERS.build(section, folder, config, first_step=first_step)
         tracker.start()
         if isinstance(tracker, MLflowTracker):

@@ -193,6 +193,8 @@ class Trainer:
             if self.accelerator.is_main_process:
                 tidy(self.run_info.checkpoints, settings.keep)
             return True
+        # A finished run that trains on is unfinished until its new end: `resume=auto` finds it.
+        (self.run_info.folder / SUMMARY).unlink(missing_ok=True)
         batches = iter(self.loader)
         with stop_requests() as stop:
             for step in range(self.run_info.step, settings.steps):

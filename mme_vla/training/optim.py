@@ -15,16 +15,6 @@ from mme_vla.training.parallel import like
 from mme_vla.training.settings import TrainSettings
 
 
-def learning_rate(step: int, peak: float, warmup: int) -> float:
-    """Rate of update `step`, from 0: linear from peak/(warmup + 1) to `peak` at step `warmup`, then
-    constant.
-    """
-    if step >= warmup:
-        return peak
-    start = peak / (warmup + 1)
-    return start + (peak - start) * step / warmup
-
-
 def scheduled_rate(step: int, settings: TrainSettings) -> float:
     """Rate of update `step`, from 0, of a recipe.
 
@@ -34,10 +24,11 @@ def scheduled_rate(step: int, settings: TrainSettings) -> float:
     """
     peak = settings.lr
     warmup = settings.warmup
-    if step < warmup and settings.warmup_from_zero:
-        return peak * step / warmup
     if step < warmup:
-        return learning_rate(step, peak, warmup)
+        start = 0.0
+        if not settings.warmup_from_zero:
+            start = peak / (warmup + 1)
+        return start + (peak - start) * step / warmup
     if settings.schedule == "cosine":
         total = settings.schedule_steps or settings.steps
         done = min((step - warmup) / max(total - warmup, 1), 1.0)
@@ -51,10 +42,11 @@ def scheduled_rate(step: int, settings: TrainSettings) -> float:
 
 def lr_factors(names: Iterable[str], spec: FineTuneSpec, settings: TrainSettings) -> list[float]:
     """Factors of the learning rate of parameters, by their component (`train.part_lr`)."""
-    for part in settings.part_lr:
+    factors = settings.part_lr or {}
+    for part in factors:
         if part not in spec.components:
             raise UserError(f"train.part_lr names {part!r}. {did_you_mean(part, spec.components)}")
-    return [settings.part_lr.get(spec.component_of(name), 1.0) for name in names]
+    return [factors.get(spec.component_of(name), 1.0) for name in names]
 
 
 def make_optimizer(

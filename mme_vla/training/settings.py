@@ -94,7 +94,7 @@ class TrainSettings:
     weight_decay: NonNegative = 1e-10
     clip_norm: Positive = 1.0
     ema: float = 0.999
-    part_lr: Mapping[str, Positive] = field(default_factory=dict)
+    part_lr: Mapping[str, Positive] | None = None
     optimizer: Literal["adamw", "lamb"] = "adamw"
     warmup_from_zero: bool = False
     schedule: Literal["constant", "cosine", "steps"] = "constant"
@@ -146,6 +146,11 @@ class TrainSettings:
             list(self.milestones) == sorted(self.milestones),
             f"train.milestones={self.milestones} must be updates in ascending order, such as"
             " [1000, 2000].",
+        )
+        require(
+            (self.schedule == "steps") == bool(self.milestones),
+            f"train.schedule={self.schedule} and train.milestones={list(self.milestones)} do not go"
+            " together: milestones belong to schedule=steps, which needs at least one.",
         )
         require(
             self.batch_size % self.accumulate == 0,
@@ -219,7 +224,7 @@ class TrainRun:
     """
 
     name: PathText
-    seed: int
+    seed: Annotated[int, Range(0, 2**63 - 1)]
     output: PathText
     trainings: PositiveInt
     resume: str | None

@@ -6,6 +6,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
@@ -169,6 +170,18 @@ def test_a_sweep_of_any_command_writes_under_outputs() -> None:
             # A job's folder is its number: the sweep may change what the name would follow from.
             (key,) = OmegaConf.to_container(cfg.hydra)["sweep"]
             assert key == "dir" and "dir: outputs/sweeps/" in file.read_text(), file
+
+
+def test_sections_whose_keys_are_free_are_filled_by_a_mapping() -> None:
+    for command, word in (
+        ("train", "train.part_lr={vlm: 0.1}"),
+        ("evaluate", "connection.keys={front: observation/left}"),
+        ("probe", "references={memoryless: outputs/present}"),
+        ("audit", "references={demonstrator: outputs/motions}"),
+        ("nano", "demonstrations_of={StopCube: {easy: 3}}"),
+    ):
+        key, _, value = word.partition("=")
+        assert OmegaConf.select(compose(command, [word]), key) == yaml.safe_load(value), word
 
 
 def test_the_same_words_give_equal_but_separate_configurations() -> None:

@@ -89,6 +89,8 @@ def test_the_default_kind_changes_no_digest_and_another_does() -> None:
         ({"schedule": "linear"}, "train.schedule='linear'. Known: constant, cosine, steps"),
         ({"schedule_steps": 5}, "train.schedule_steps=5 must be no fewer than train.warmup=10"),
         ({"milestones": (30, 20)}, "ascending order"),
+        ({"milestones": (20, 30)}, "milestones belong to schedule=steps"),
+        ({"schedule": "steps"}, "schedule=steps, which needs at least one"),
         ({"gamma": 0}, "train.gamma=0"),
     ],
 )

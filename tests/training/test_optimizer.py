@@ -12,31 +12,52 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError
 from mme_vla.speed.compiler import missing_compiler
 from mme_vla.testing.small import small_policy
-from mme_vla.training.optim import EMA, WeightUpdate, clip_gradients, learning_rate, make_optimizer
+from mme_vla.training.optim import (
+    EMA,
+    WeightUpdate,
+    clip_gradients,
+    lr_factors,
+    make_optimizer,
+    scheduled_rate,
+)
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.settings import TrainSettings
 
 
 def test_learning_rate_follows_the_released_schedule(parity: Path) -> None:
     golden = json.loads((parity / "unit_optimizer.json").read_text())["lr_schedule"]
+    released = TrainSettings(steps=80_000, batch_size=64, lr=5e-5, warmup=10_000)
     for step, rate in golden.items():
         # The released schedule runs in float32 and cancels at its first steps: 4e-8 of the peak.
-        assert learning_rate(int(step), 5e-5, 10_000) == pytest.approx(
-            rate, rel=2e-6, abs=5e-5 * 1e-7
-        )
+        assert scheduled_rate(int(step), released) == pytest.approx(rate, rel=2e-6, abs=5e-5 * 1e-7)
+
+
+def test_components_learn_at_their_own_share_of_the_rate() -> None:
+    settings = TrainSettings.from_dict(
+        {"steps": 1, "batch_size": 1, "lr": 1e-3, "part_lr": {"vlm": 0.5}}
+    )
+    spec = small_policy("pi05").finetune_spec
+    names = [name for name, _ in small_policy("pi05").named_parameters()]
+    shares = lr_factors(names, spec, settings)
+    assert set(shares) == {1.0, 0.5}
+    for name, share in zip(names, shares, strict=True):
+        assert share == (0.5 if spec.component_of(name) == "vlm" else 1.0), name
+    without = TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1e-3, "part_lr": None})
+    assert set(lr_factors(names, spec, without)) == {1.0}
 
 
 def test_updates_and_averages_equal_the_released_ones(parity: Path) -> None:
     golden = load_file(parity / "unit_optimizer.safetensors")
     names = [key.removeprefix("out/step0/") for key in golden if key.startswith("out/step0/")]
     module = nn.ParameterDict({name: nn.Parameter(golden[f"in/{name}"].clone()) for name in names})
-    optimizer = make_optimizer(module.parameters(), TrainSettings(steps=5, batch_size=1, lr=1e-2))
+    settings = TrainSettings(steps=5, batch_size=1, lr=1e-2, warmup=3)
+    optimizer = make_optimizer(module.parameters(), settings)
     ema = EMA(dict(module.items()), 0.999)
     for step in range(5):
         for name in names:
             module[name].grad = golden[f"in/grad{step}/{name}"].clone()
         clip_gradients([p.grad for p in module.parameters() if p.grad is not None], 1.0)
-        optimizer.param_groups[0]["lr"] = learning_rate(step, 1e-2, 3)
+        optimizer.param_groups[0]["lr"] = scheduled_rate(step, settings)
         optimizer.step()
         ema.update()
         for name in names:

@@ -3,6 +3,7 @@ is unfinished.
 """
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -94,6 +95,28 @@ def test_several_trainings_resume_and_share_a_cache(
 def test_the_number_of_trainings_is_checked(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="trainings=0"):
         command.main(compose("train", [*SMALL, f"output={tmp_path}", "trainings=0"]))
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_beyond_those_of_random_numbers_is_refused(seed: int, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=f"seed={seed} must be a whole number from 0"):
+        command.main(compose("train", [*SMALL, f"output={tmp_path}", f"seed={seed}"]))
+
+
+def test_a_job_of_a_sweep_writes_where_its_output_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = []
+    monkeypatch.setattr(command, "train", lambda run, folder, *_: places.append(folder))
+    job = tmp_path / "sweep" / "1"
+    for word in (f"output={tmp_path}/lr${{train.lr}}", "train.steps=2"):
+        hydra = SimpleNamespace(
+            runtime=SimpleNamespace(output_dir=str(job)), overrides=SimpleNamespace(task=[word])
+        )
+        fake = SimpleNamespace(initialized=lambda: True, get=lambda hydra=hydra: hydra)
+        monkeypatch.setattr(command, "HydraConfig", fake)
+        command.main(compose("train", [*SMALL, "trainings=1", "train.lr=0.5", word]))
+    assert places == [tmp_path / "lr0.5", job]
 
 
 def test_a_folder_holds_a_single_run_or_several_trainings(tmp_path: Path) -> None:

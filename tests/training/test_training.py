@@ -218,6 +218,20 @@ def test_auto_resumes_the_newest_unfinished_run_or_begins(two_steps: Path, tmp_p
     assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
 
 
+def test_a_finished_run_that_trains_on_is_unfinished_again(tmp_path: Path) -> None:
+    first = train(tmp_path / "a", steps=1)
+    summary = tmp_path / "a" / "summary.json"
+    summary.write_text("{}")
+    config = {"train": {**RECIPE, "steps": 2}, "seed": 1}
+    assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
+    run = Run(tmp_path / "a", first.last_checkpoint, 1)
+    train(tmp_path / "a", run=run, steps=1)
+    assert summary.exists()
+    train(tmp_path / "a", run=run, steps=2)
+    assert not summary.exists()
+    assert open_run(tmp_path / "b", "auto", config).step == 2
+
+
 def write_unsummed(file: Path, text: str) -> None:
     (file.parent / "SHA256SUMS").unlink()
     file.write_text(text)
@@ -324,6 +338,21 @@ def test_tensorboard_records_numbers_and_images(tmp_path: Path) -> None:
     events.Reload()
     assert [event.step for event in events.Scalars("train/loss")] == [3, 4]
     assert events.Tags()["images"] == ["plot"]
+
+
+def test_tensorboard_drops_points_of_a_run_killed_before_its_first_checkpoint(
+    tmp_path: Path,
+) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    Accelerator(cpu=True)
+    for loss in (0.5, 0.25):
+        opened = open_loggers(tmp_path, {}, 0, {"name": "tensorboard"})
+        opened.write(1, {"train/loss": loss})
+        opened.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [event.value for event in events.Scalars("train/loss")] == [0.25]
 
 
 def test_wandb_records_offline_and_a_resumed_run_keeps_its_id(tmp_path: Path) -> None:

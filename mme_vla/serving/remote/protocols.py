@@ -157,7 +157,7 @@ class ServerProtocol:
 
     def observation(self, frames: NewFrames) -> dict[str, Any]:
         """The current frame as openpi's servers read it."""
-        keys = self.choice.connection.keys
+        keys = self.choice.connection.keys or {}
         released = released_keys(self.robot)
         message: dict[str, Any] = {}
         for name in self.robot.camera_names:

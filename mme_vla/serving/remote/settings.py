@@ -22,7 +22,7 @@ class ConnectionSettings:
     open_s: Positive = 60
     episodes: PositiveInt | None = None
     subgoal: Subgoals | None = None
-    keys: Mapping[str, str] = field(default_factory=dict)
+    keys: Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
         key = self.api_key or ""
