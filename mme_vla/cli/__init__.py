@@ -32,12 +32,12 @@ def run(name: str) -> None:
     # busy waiting slows a step tenfold. It counts only when set before PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     atexit.register(_end_quietly)
+    warnings.showwarning = _show_warning
     with print_user_errors():
         command = commands()[name]
         if _PRINTING.isdisjoint(sys.argv[1:]):
             check_launcher(name)
         if command.reads_words or not command.config:
-            warnings.showwarning = _show_warning
             load_main(command)()
             return
         from mme_vla.cli.command import run_configured  # Hydra, which other commands do without

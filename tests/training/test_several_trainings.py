@@ -2,6 +2,7 @@
 is unfinished.
 """
 
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from mme_vla import MMEPolicy, UserError
+from mme_vla import MMEPolicy, UserError, cli
 from mme_vla.cli import evaluate as evaluation
 from mme_vla.cli import train as command
 from mme_vla.config.composition import compose
@@ -117,6 +118,18 @@ def test_a_job_of_a_sweep_writes_where_its_output_says(
         monkeypatch.setattr(command, "HydraConfig", fake)
         command.main(compose("train", [*SMALL, "trainings=1", "train.lr=0.5", word]))
     assert places == [tmp_path / "lr0.5", job]
+
+
+def test_the_training_command_prints_a_warning_without_its_place_in_the_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(command, "train", lambda *_: warnings.warn("mind this", stacklevel=1))
+    monkeypatch.setattr("sys.argv", ["mme-vla", "model=pi05", f"output={tmp_path}"])
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # put back afterwards
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        cli.run("train")
+    assert "Warning: mind this" in capsys.readouterr().err.splitlines()
 
 
 def test_a_folder_holds_a_single_run_or_several_trainings(tmp_path: Path) -> None:
