@@ -172,7 +172,7 @@ def _check_file(
     total = int(lengths.sum())
     with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
         stream = container.streams.video[0]
-        tick = float(stream.time_base or 0)
+        time_base = float(stream.time_base or 0)
         rate, base = float(stream.average_rate or 0), float(stream.base_rate or 0)
         pixel_format = str(stream.codec_context.pix_fmt)
         size = (stream.codec_context.width, stream.codec_context.height)
@@ -183,16 +183,16 @@ def _check_file(
             stream.frames == total
             and rate > 0
             and abs(rate - base) <= 1e-3 * base
-            and abs((stream.start_time or 0) * tick * fps) <= QUARTER
+            and abs((stream.start_time or 0) * time_base * fps) <= QUARTER
             and abs(total / rate - total / fps) * fps <= QUARTER
-            and abs((stream.duration or 0) * tick * fps - total) <= QUARTER
+            and abs((stream.duration or 0) * time_base * fps - total) <= QUARTER
             and (np.abs(begins * fps - firsts) <= QUARTER).all()
         ):
             return size
         ticks = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
         if not ticks:
             raise ValueError("it holds no picture")
-    times = np.sort(np.array(ticks, np.int64)) * tick
+    times = np.sort(np.array(ticks, np.int64)) * time_base
     for episode, begin, length, first in zip(episodes, begins, lengths, firsts, strict=True):
         targets = begin + np.arange(length) / fps
         after = np.clip(np.searchsorted(times, targets), 1, max(len(times) - 1, 1))

@@ -115,10 +115,12 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         3}` names one.
         """
         super().reset(seed=seed)
-        options = options or {}
-        unknown = sorted(set(options) - {"episode"})
-        require(not unknown, f"Unknown reset options {listed(unknown)}; there is episode alone.")
-        number = options.get("episode", self.episode)
+        remaining = dict(options or {})
+        number = remaining.pop("episode", self.episode)
+        require(
+            not remaining,
+            f"Unknown reset options {listed(sorted(remaining))}; there is episode alone.",
+        )
         if number is None:
             number = int(self.np_random.integers(self._count))
         frames, info = self._open(number).reset()

@@ -32,7 +32,7 @@ def test_learning_rate_follows_the_released_schedule(parity: Path) -> None:
         assert scheduled_rate(int(step), released) == pytest.approx(rate, rel=2e-6, abs=5e-5 * 1e-7)
 
 
-def test_components_learn_at_their_own_share_of_the_rate() -> None:
+def test_components_learn_at_their_share_of_the_rate() -> None:
     settings = TrainSettings.from_dict(
         {"steps": 1, "batch_size": 1, "lr": 1e-3, "part_lr": {"vlm": 0.5}}
     )

@@ -104,7 +104,7 @@ def test_a_seed_beyond_those_of_random_numbers_is_refused(seed: int, tmp_path: P
         command.main(compose("train", [*SMALL, f"output={tmp_path}", f"seed={seed}"]))
 
 
-def test_a_job_of_a_sweep_writes_where_its_output_says(
+def test_a_job_of_a_sweep_has_the_folder_that_output_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     places = []
