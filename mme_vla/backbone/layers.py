@@ -95,7 +95,10 @@ def rotation(positions: Tensor, head_dim: int) -> Rotation:
 
 
 def rotate(x: Tensor, rope: Rotation) -> Tensor:
-    """Rotate queries or keys [b, n, heads, e]; the result keeps the dtype of x."""
+    """Rotate queries or keys [b, n, heads, e] of halves a and b: (a cos − b sin, b cos + a sin).
+    The result keeps the dtype of x.
+    """
+    # Gradients add up in float32. Without them the products read x as it is, in the same precision.
     exact = x.float() if torch.is_grad_enabled() else x
     a, b = exact.chunk(2, dim=-1)
     swapped = torch.cat([b, a], dim=-1)

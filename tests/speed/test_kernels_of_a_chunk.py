@@ -92,7 +92,7 @@ def run_on(driver: Path, program: str, *words: str) -> str:
     ("model", "way", "launches", "products"),
     [
         ("pi05", "compiled", 1310, 921),
-        ("framesamp_modul", "compiled", 1910, 1479),
+        ("framesamp_modul", "compiled", 1920, 1479),
         ("tokendrop_expert", "compiled", 1320, 990),
         ("ttt_expert", "compiled", 1320, 990),
         ("rmt_context", "compiled", 1320, 921),
