@@ -536,12 +536,12 @@ class EpisodeEnv:
         if self._frames == 0:
             require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
             self._names = set(frame)
-        require(
-            set(frame) == self._names,
-            f"{self.spec.task}: frame {self._frames} of the episode has {listed(sorted(frame))},"
-            f" and frame 0 has {listed(sorted(self._names))}. Give the same cameras and the state"
-            " in every observation.",
-        )
+        place = f"{self.spec.task}: frame {self._frames} of the episode"
+        remedy = "Give the same cameras and the state in every observation."
+        missing = sorted(self._names - set(frame))
+        require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
+        added = sorted(set(frame) - self._names)
+        require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
         self._frames += 1
         return frame
 
