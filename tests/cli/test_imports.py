@@ -58,7 +58,7 @@ WITHOUT = {
     "environments": (
         [],
         (
-            "import sys, mme_vla.envs as e; e.make_env, e.episodes\nassert 'mani_skill' not in"
+            "import sys, mme_vla.envs as e; e.make_env, e.episode\nassert 'mani_skill' not in"
             " sys.modules"
         ),
     ),
