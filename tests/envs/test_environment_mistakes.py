@@ -173,7 +173,7 @@ def test_workers_take_episodes_as_commands_do(
 def test_workers_are_not_started_for_an_unknown_reward(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mme_vla.envs.make.require_simulator", lambda: None)
     with pytest.raises(UserError, match="Did you mean 'sparse'"):
-        pool.make_vec_env("StopCube", [0], reward="sparce")
+        pool.make_vec_env("StopCube", [0], reward="sparsely")
 
 
 @pytest.mark.parametrize(
