@@ -8,17 +8,21 @@ SAME_ERRORS = 2  # equal errors that an environment's code raised, in a row
 
 
 class FailureStreaks:
-    """Counts the failures of a rollout's episodes in a row, by kind.
-
-    not_started: environments that failed before the first frame; to be set to 0 where one did not.
-    without_chunk: episodes in which the policy chose no chunk; to be set to 0 where it chose one.
-    """
+    """Counts the failures of a rollout's episodes in a row, by kind."""
 
     def __init__(self) -> None:
-        self.not_started = 0
-        self.without_chunk = 0
+        self._not_started = 0  # episodes whose environments failed before the first frame
+        self._without_chunk = 0  # episodes in which the policy chose no chunk
         self._same_errors = 0  # episodes that the same error of an environment's code ended
         self._error = ""  # the last one
+
+    def note_start(self) -> None:
+        """An environment delivered its first frames."""
+        self._not_started = 0
+
+    def note_chunk(self) -> None:
+        """The policy chose a chunk."""
+        self._without_chunk = 0
 
     def note_end(self, reply: Reply, message: str | None, is_repeated: bool) -> None:
         """An episode ended with this reply of its environment.
@@ -35,7 +39,7 @@ class FailureStreaks:
         # simulator.
         is_unbuildable = isinstance(reply.error, SceneError)
         if reply.is_reset and not is_unbuildable:
-            self.not_started += 1
+            self._not_started += 1
         if reply.error is None:
             self._same_errors = 0
         elif place_of(reply.error) is not None and not is_repeated:
@@ -50,9 +54,9 @@ class FailureStreaks:
                     f" environment's code, so the run stops: {text} Mend it, and repeat the"
                     " command: finished episodes are kept."
                 )
-        if self.not_started >= GIVE_UP_AFTER:
+        if self._not_started >= GIVE_UP_AFTER:
             raise UserError(
-                f"{self.not_started} environments in a row could not be started, so the run"
+                f"{self._not_started} environments in a row could not be started, so the run"
                 f" stops; the last one: {message}"
             )
 
@@ -62,9 +66,9 @@ class FailureStreaks:
         Raises:
             UserError: it did so in `GIVE_UP_AFTER` episodes in a row.
         """
-        self.without_chunk += 1
-        if self.without_chunk >= GIVE_UP_AFTER:
+        self._without_chunk += 1
+        if self._without_chunk >= GIVE_UP_AFTER:
             raise UserError(
-                f"The policy chose no chunk in {self.without_chunk} episodes in a row, so the run"
+                f"The policy chose no chunk in {self._without_chunk} episodes in a row, so the run"
                 f" stops; the last one: {reason}"
             )

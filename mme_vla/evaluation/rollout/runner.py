@@ -191,7 +191,7 @@ class Rollout:
             self._take_last(running, reply)
             return
         if reply.is_reset:
-            self._failures.not_started = 0
+            self._failures.note_start()
             if self._rerenders_video(running, reply):
                 return
             running.begin(reply.observation)
@@ -278,7 +278,7 @@ class Rollout:
                     self._failures.note_no_chunk(failure.reason)
                 self._finish(running, "error", failure.reason, retry=failure.again)
                 continue
-            self._failures.without_chunk = 0
+            self._failures.note_chunk()
             actions = chunk[:execute]
             if not np.isfinite(actions).all():
                 self._finish(
