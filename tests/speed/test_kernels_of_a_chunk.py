@@ -87,6 +87,13 @@ def run_on(driver: Path, program: str, *words: str) -> str:
     return done.stdout
 
 
+def check_counts(printed: str, launches: int, products: int) -> None:
+    counted = json.loads(printed.splitlines()[-1])
+    assert counted["launches"] <= launches
+    assert counted["products"] == products
+    assert counted["waits"] == 0
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     ("model", "way", "launches", "products"),
@@ -103,11 +110,7 @@ def run_on(driver: Path, program: str, *words: str) -> str:
 def test_a_full_size_chunk_launches_few_kernels(
     model: str, way: str, launches: int, products: int, mock_driver: Path
 ) -> None:
-    words = ("gpu_kernels.py", model, "--ways", way)
-    counted = json.loads(run_on(mock_driver, *words).splitlines()[-1])
-    assert counted["launches"] <= launches
-    assert counted["products"] == products
-    assert counted["waits"] == 0
+    check_counts(run_on(mock_driver, "gpu_kernels.py", model, "--ways", way), launches, products)
 
 
 @pytest.mark.nightly
@@ -126,10 +129,7 @@ def test_a_full_size_update_launches_few_kernels(
     model: str, way: str, launches: int, products: int, mock_driver: Path
 ) -> None:
     words = ("gpu_kernels.py", model, "--what", "update", "--ways", way, "--batch", "1")
-    counted = json.loads(run_on(mock_driver, *words).splitlines()[-1])
-    assert counted["launches"] <= launches
-    assert counted["products"] == products
-    assert counted["waits"] == 0
+    check_counts(run_on(mock_driver, *words), launches, products)
 
 
 @pytest.mark.nightly
