@@ -33,7 +33,9 @@ class CacheMissingError(UserError):
 
 
 def default_cache_root() -> Path:
-    """Where caches go unless told otherwise: $MME_VLA_CACHE, else ~/.cache/mme_vla."""
+    """Where caches go unless told otherwise: `vision` in $MME_VLA_CACHE, else in
+    ~/.cache/mme_vla.
+    """
     return user_cache("vision")
 
 

@@ -50,8 +50,8 @@ class EpisodeWriting:
 
     precision: share of the kept frames that show a fact.
     recall: share of the facts so far of which a frame is kept. Both are means over the steps of the
-        execution. chance_precision,
-    chance_recall: the expectation for as many frames at random.
+        execution.
+    chance_precision, chance_recall: the expectation for as many frames at random.
     lags: of each fact that was kept at some step, frames from its first frame to the first such
         step.
     """

@@ -20,7 +20,7 @@ from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.extras.nano import evaluating, fitting, runs, tokens
-from mme_vla.extras.nano.cli.nano import with_settings
+from mme_vla.extras.nano.cli.nano import main, with_settings
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.policy.mme import MMEPolicy
@@ -42,6 +42,22 @@ def test_models_and_budgets_are_lists_of_one_run() -> None:
     swept = with_settings(["-m", "task=VideoUnmask", "model=a", "seed=0,1"])
     assert swept[1:] == ["-m", "task=VideoUnmask", "with_memory=a", "seed=0,1", "also=[]"]
     assert "--multirun" in with_settings(["--multirun", "model=a,b", "seed=0,1"])
+
+
+def test_help_is_of_the_command_and_not_of_the_settings_that_it_begins_with(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["--help"], ["-h"]):
+        monkeypatch.setattr("sys.argv", ["mme-vla nano", *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        text = capsys.readouterr().out
+        assert ended.value.code == 0
+        assert text.startswith("Usage: mme-vla nano") and "\n  rendered_for: " in text
+    monkeypatch.setattr("sys.argv", ["mme-vla nano", "--help", "nano=RouteStick"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "nano=RouteStick" in capsys.readouterr().out
 
 
 @pytest.mark.nightly

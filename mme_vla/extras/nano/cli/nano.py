@@ -27,7 +27,9 @@ def main() -> None:
         from mme_vla.extras.nano.cli import board
 
         return board.main(sys.argv[2:], main, with_settings)
-    sys.argv[1:] = with_settings(sys.argv[1:])
+    # Beside --help words name files to show, and choose none.
+    if not {"--help", "-h"} & {*sys.argv}:
+        sys.argv[1:] = with_settings(sys.argv[1:])
     run_configured("nano", command)
 
 
