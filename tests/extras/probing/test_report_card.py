@@ -38,6 +38,7 @@ from mme_vla.extras.probing.card import (
     write_card,
 )
 from mme_vla.extras.probing.channels import channel_of
+from mme_vla.extras.probing.cli import probe as probe_command
 from mme_vla.extras.probing.lines import MomentLine
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording
@@ -372,3 +373,14 @@ def test_a_card_tells_memory_off_from_memoryless_and_takes_a_memoryless_training
     assert "which is not a memoryless policy" in (tmp_path / "card.html").read_text()
     with pytest.raises(UserError, match="holds records of framesamp_modul, which has a memory"):
         run_card(reader(TIME), *arguments, {"memoryless": str(tmp_path / "wrong")})
+
+
+@pytest.mark.parametrize("words", [["card", "--help"], ["twins", "-h"]])
+def test_help_of_a_card_and_of_twins_is_that_of_a_probe(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["mme-vla probe", *words])
+    with pytest.raises(SystemExit) as ended:
+        probe_command.main()
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("Usage: mme-vla probe")

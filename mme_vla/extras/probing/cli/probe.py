@@ -18,7 +18,10 @@ logger = logging.getLogger("mme_vla.probe")
 def main() -> None:
     """Run the command; a first word `card` or `twins` means `card=true` or `twins=true`."""
     if sys.argv[1:2] in (["card"], ["twins"]):
-        sys.argv[1] += "=true"
+        word = sys.argv.pop(1)
+        # Beside --help words name files to show.
+        if not {"--help", "-h"} & {*sys.argv}:
+            sys.argv.insert(1, f"{word}=true")
     run_configured("probe", probe, check="mme_vla.extras.probing.settings:check_probe")
 
 
