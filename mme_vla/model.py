@@ -250,6 +250,7 @@ class MMEModel(nn.Module):
         """
         return self.loss(batch, noise, memory, augmentation)
 
+    @torch.inference_mode(False)  # real-time chunking asks for a gradient
     @torch.no_grad()
     def sample(
         self,

@@ -101,10 +101,12 @@ def train_several(run: TrainRun, folder: Path, named: bool = True) -> list[Path]
         one = TrainRun.from_config({**run.config, **own})
         existing = open_run(place, "auto", one.config, named=True)
         is_finished = (place / SUMMARY).is_file() and existing.step == one.train.steps
+        line = f"training {number + 1} of {run.trainings}, seed {one.seed}, in {place}"
         if is_finished and existing.checkpoint is not None:
+            print(f"{line}: finished")
             checkpoints.append(existing.checkpoint)
             continue
-        print(f"training {number + 1} of {run.trainings}, seed {one.seed}, in {place}")
+        print(line)
         checkpoints.append(train(one, place, time.perf_counter(), tower_seed=run.seed))
     return checkpoints
 
@@ -211,6 +213,11 @@ def _train(
         name=run.name,
     )
     line.say(trainer.describe())
+    if run.train.warmup >= run.train.steps:
+        line.say(
+            f"train.warmup={run.train.warmup} does not end within train.steps={run.train.steps}:"
+            f" no update has the full rate, train.lr={run.train.lr:g}"
+        )
     loggers = Loggers()
     if first:
         loggers = open_loggers(place.folder, saved_config, place.step, run.logger)

@@ -9,6 +9,7 @@ take several seconds to import.
 
 import logging
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -254,7 +255,7 @@ def _missing_columns(
         if near is not None:
             message += f" Did you mean `key: {near}` for {name}?"
     return (
-        f"{message} `mme-vla inspect dataset={root}` drafts that file, and"
+        f"{message} `mme-vla inspect {shlex.quote(f'dataset={root}')}` drafts that file, and"
         " docs/extend/your-robot.md explains it."
     )
 
@@ -286,8 +287,9 @@ def resolve_root(root: str | Path) -> Path:
     require(
         version.startswith("v3."),
         f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own"
-        f" command: `python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name}"
-        f" --root={path} --push-to-hub=false`.",
+        " command: `python -m lerobot.scripts.convert_dataset_v21_to_v30"
+        f" --repo-id={shlex.quote(path.name)} --root={shlex.quote(str(path))}"
+        " --push-to-hub=false`.",
     )
     missing = []
     if not (path / TASKS).exists():

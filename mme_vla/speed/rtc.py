@@ -55,7 +55,7 @@ def rtc_guidance(velocity: Velocity, overlap: Overlap, times: Tensor) -> Velocit
 
     def pulled(x: Tensor, index: int) -> Tensor:
         with torch.enable_grad():
-            x = x.detach().requires_grad_(True)
+            x = x.detach().clone().requires_grad_(True)
             free = velocity(x, index).float()
             end = x - times[index] * free
             missing = (overlap.actions - end.detach()) * overlap.weight

@@ -1,6 +1,7 @@
 """AdamW, warm-up, schedule, clipping: the released recipes, number by number."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -43,10 +44,16 @@ def scheduled_rate(step: int, settings: TrainSettings) -> float:
 def lr_factors(names: Iterable[str], spec: FineTuneSpec, settings: TrainSettings) -> list[float]:
     """Factors of the learning rate of parameters, by their component (`train.part_lr`)."""
     factors = settings.part_lr or {}
+    parts = [spec.component_of(name) for name in names]
     for part in factors:
         if part not in spec.components:
             raise UserError(f"train.part_lr names {part!r}. {did_you_mean(part, spec.components)}")
-    return [factors.get(spec.component_of(name), 1.0) for name in names]
+        if part not in parts:
+            warnings.warn(
+                f"train.part_lr.{part} has no effect: no weight of {part} is trained.",
+                stacklevel=2,
+            )
+    return [factors.get(part, 1.0) for part in parts]
 
 
 def make_optimizer(

@@ -89,6 +89,16 @@ def test_a_prefix_changes_its_episode_alone(policy: MMEPolicy, before: np.ndarra
     np.testing.assert_allclose(together[1], policy.act(episode_of(policy, seed=5)), atol=1e-5)
 
 
+def test_a_prefix_counts_inside_inference_mode(policy: MMEPolicy, before: np.ndarray) -> None:
+    chunks = []
+    for mode in (False, True):
+        with torch.inference_mode(mode):
+            episode = episode_of(policy)
+            episode.set_action_prefix(before, delay=4)
+            chunks.append(policy.act(episode))
+    np.testing.assert_array_equal(*chunks)
+
+
 @pytest.mark.parametrize(
     ("actions", "delay", "message"),
     [

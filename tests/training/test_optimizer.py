@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.errors import UserError
 from mme_vla.speed.compiler import missing_compiler
 from mme_vla.testing.small import small_policy
@@ -44,6 +45,15 @@ def test_components_learn_at_their_share_of_the_rate() -> None:
         assert share == (0.5 if spec.component_of(name) == "vlm" else 1.0), name
     without = TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1e-3, "part_lr": None})
     assert set(lr_factors(names, spec, without)) == {1.0}
+
+
+def test_a_rate_of_a_part_that_does_not_learn_is_reported() -> None:
+    settings = TrainSettings(steps=1, batch_size=1, lr=1.0, part_lr={"vlm": 0.5, "vision": 0.1})
+    with pytest.warns(UserWarning, match=r"train\.part_lr\.vision has no effect"):
+        shares = lr_factors(
+            ["embedding.weight", "action_in.weight"], Pi05Backbone.finetune_spec, settings
+        )
+    assert shares == [0.5, 1.0]
 
 
 def test_updates_and_averages_equal_the_released_ones(parity: Path) -> None:

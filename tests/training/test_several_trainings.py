@@ -39,7 +39,7 @@ SMALL = [
 
 @pytest.mark.slow
 def test_several_trainings_resume_and_share_a_cache(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "runs" / "two"
     words = [*SMALL, f"output={output}", f"data.cache.root={tmp_path / 'cache'}"]
@@ -60,6 +60,9 @@ def test_several_trainings_resume_and_share_a_cache(
     assert (
         calls == ["training_0", "training_1", "training_1"] and first.stat().st_mtime_ns == stored
     )
+    printed = capsys.readouterr().out
+    assert f"training 1 of 2, seed 42, in {output / 'training_0'}: finished" in printed
+    assert "train.warmup=20 does not end within train.steps=2" in printed
     policies = [MMEPolicy.from_pretrained(locate_checkpoint(run)) for run in trainings_in(output)]
     facts = [facts_of(policy, None, "one", RolloutSettings(), None).training for policy in policies]
     assert [one and one.seed for one in facts] == [42, 43] and len(

@@ -3,6 +3,7 @@
 A row has `messages`, `images`, `videos` and `objects`.
 """
 
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -204,7 +205,8 @@ def read_rows(file: str | Path) -> list[TrainingRow]:
     path = Path(file)
     require(
         path.is_file(),
-        f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}",
+        f"{path} does not exist. Build it: mme-vla subgoal-build input=…"
+        f" {shlex.quote(f'output={path.parent}')}",
     )
     Sums(path.parent, remedy="Build the training data again").check(path.name)
     rows = read_lines(path, _checked_row, "rows of training data", limit=_LIMIT)
