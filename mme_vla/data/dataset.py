@@ -163,15 +163,15 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         )
         if subgoal is not None:
             for source in sources:
-                lacking = sorted(set(subgoal.columns) - set(source.subgoal_names))
                 require(
-                    not lacking,
-                    f"{source.name} has no {' and no '.join(lacking)}, which"
+                    subgoal.kind in source.subgoal_names,
+                    f"{source.name} has no column {subgoal.kind}, which"
                     f" subgoal_text.kind={subgoal.kind} reads; its subgoal texts are:"
                     f" {', '.join(source.subgoal_names) or 'none'}.",
                 )
-                for name in subgoal.columns:
-                    text_column(source, name, f"subgoal_text.kind={subgoal.kind}")
+                for name in source.subgoal_names:
+                    if name.startswith(subgoal.kind):
+                        text_column(source, name, f"subgoal_text.kind={subgoal.kind}")
         rate = processor.embodiment.fps
         if processor.samples.history is not None and rate is not None:
             for source in sources:

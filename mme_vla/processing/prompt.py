@@ -254,8 +254,9 @@ class SubgoalText:
     """Chooses the text of one training step, as released. `from_config` checks its values.
 
     kind: `simple_subgoal` or `grounded_subgoal`.
-    online_probability: how often the label is the one the simulator reports at test time, which
-        switches a little earlier than the planner's.
+    online_probability: how often the label is the one the simulator reports at test time
+        (`<kind>_online`), which switches a little earlier than the planner's. Without that column
+        it is always the planner's.
     point_noise: pixels; a text with exactly one point `at <y, x>` gets Gaussian noise on both
         numbers, cut off here and rounded. 0 adds none. The result may leave the image, as released.
     """
@@ -271,16 +272,11 @@ class SubgoalText:
             return None
         return read_section(cls, config, "subgoal_text")
 
-    @property
-    def columns(self) -> tuple[str, str]:
-        """The dataset columns it reads."""
-        return self.kind, f"{self.kind}_online"
-
     def __call__(self, texts: Mapping[str, str], rng: np.random.Generator) -> str:
         """Choose among a step's `texts`, by column name, and perturb the point."""
-        planner, online = self.columns
-        is_online = rng.random() < self.online_probability
-        text = texts[online] if is_online else texts[planner]
+        text = texts[self.kind]
+        if rng.random() < self.online_probability:
+            text = texts.get(f"{self.kind}_online", text)
         if self.point_noise:
             text = perturb_point(text, self.point_noise, rng)
         return text

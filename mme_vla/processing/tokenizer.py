@@ -3,6 +3,7 @@ for the sample.
 """
 
 import hashlib
+import unicodedata
 from importlib.resources import files
 from pathlib import Path
 from typing import Self
@@ -71,8 +72,12 @@ class Tokenizer:
         return self._processor.vocab_size()
 
     def encode(self, text: str, bos: bool = True) -> list[int]:
-        """Turn a text into ids, after the beginning-of-sequence token if `bos`."""
-        return self._processor.encode(text, add_bos=bos)
+        """Turn a text into ids, after the beginning-of-sequence token if `bos`.
+
+        Letters with accents have the same ids whether they are one character or two, as some
+        keyboards and systems of files write them.
+        """
+        return self._processor.encode(unicodedata.normalize("NFC", text), add_bos=bos)
 
     def piece(self, text: str) -> int:
         """The id of one piece, as the model spells it (`▁` means a space)."""

@@ -58,6 +58,22 @@ def test_half_of_the_texts_are_the_online_ones():
     assert SubgoalText("simple_subgoal", online_probability=0)(TEXTS, rng) == "put it down"
 
 
+def test_a_dataset_without_the_online_texts_trains_on_the_others():
+    source = EpisodeSource("sample")
+    source.subgoal_names = ("simple_subgoal",)
+    policy = build_policy("simplesg")
+    policy.processor.stats = small_policy("pi05").processor.stats
+    choose = SubgoalText.from_config(policy.config["subgoal_text"])
+    data = TrainingDataset([source], policy.processor, subgoal=choose)
+    prompts = set()
+    for epoch in range(8):
+        data.set_epoch(epoch)
+        prompts.add(words(policy, data[5]))
+    assert len(prompts) == 1 and source.subgoals(0, data.step(5).index)[
+        "simple_subgoal"
+    ] in " ".join(prompts.pop().split())
+
+
 @pytest.mark.parametrize("model", ["simplesg", "groundsg"])
 def test_training_prompts_hold_goal_and_subgoal(model, source):
     policy = build_policy(model)

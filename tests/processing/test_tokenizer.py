@@ -2,6 +2,7 @@
 clearly.
 """
 
+import unicodedata
 from pathlib import Path
 
 import huggingface_hub
@@ -42,6 +43,13 @@ def test_every_text_survives_the_round_trip(tokenizer: Tokenizer, text: str) -> 
     ids = tokenizer.encode(text)
     assert 3 not in ids
     assert tokenizer.decode(ids) == text
+
+
+def test_accents_of_one_character_and_of_two_have_the_same_ids(tokenizer: Tokenizer) -> None:
+    text = "Größe: plier la serviette d'été"
+    apart = unicodedata.normalize("NFD", text)
+    assert apart != text
+    assert tokenizer.encode(apart) == tokenizer.encode(text)
 
 
 def test_training_on_the_shipped_corpus_gives_the_shipped_model(tokenizer: Tokenizer) -> None:
