@@ -12,6 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.processing.prompt import warn_once
 from mme_vla.utils import read_json
 
 EPSILON = 1e-6  # keeps a dimension that never moves finite
@@ -366,6 +367,8 @@ class RunningStats:
 # multiples of the widest range; a broken driver says 1e30, a robot never leaves its joints' limits
 # by that
 REACH = 100
+# multiples of the largest value in training; degrees in place of radians are 57 times as large
+FAR = 10
 
 
 def finite_array(values: object, what: str) -> np.ndarray:
@@ -383,7 +386,7 @@ def finite_array(values: object, what: str) -> np.ndarray:
 
 def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> None:
     """Refuse values [..., d] that lie further from the middle than `REACH` times the widest range
-    q01…q99.
+    q01…q99, and warn of those in other units than in training.
 
     The widest range of all dimensions counts, so that one which hardly moved in training (a
     gripper) may move.
@@ -399,4 +402,17 @@ def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> N
             f"{what} has {values[place]:.4g} for number {d + 1} of {values.shape[-1]}; in the"
             f" training data it lies within {stats.q01[d]:.4g} and {stats.q99[d]:.4g}. Check the"
             " driver and the units."
+        )
+    # Other units make most numbers larger that are not near zero; some are at any time.
+    trained = np.maximum(np.abs(stats.q01), np.abs(stats.q99))
+    reached = np.abs(values).reshape(-1, len(stats)).max(axis=0, initial=0)
+    times = reached / np.maximum(trained, 1e-3)
+    if (times > FAR).mean() > 0.25:
+        d = int(times.argmax())
+        warn_once(
+            f"{what} has {(times > FAR).sum()} of {len(stats)} numbers more than {FAR} times as"
+            f" large as any in the training data, such as number {d + 1} with {reached[d]:.4g} in"
+            f" place of at most {trained[d]:.4g}. Check the units: degrees and radians differ by"
+            " 57.",
+            key=(FAR, trained.tobytes()),
         )

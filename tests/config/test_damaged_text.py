@@ -65,6 +65,21 @@ def test_states_well_beyond_the_statistics_are_a_broken_driver() -> None:
         check_reach(np.array([[0, 1e30, 0, 0, 0, 0, 0, 0]], np.float32), stats, "a state")
 
 
+def test_states_in_degrees_are_named_where_training_had_radians(
+    recwarn: pytest.WarningsRecorder,
+) -> None:
+    ones = np.ones(8)
+    stats = QuantileStats(mean=0 * ones, std=ones, q01=-3 * ones, q99=2 * ones)
+    radians = np.array([[0, 1, -1.5, 2, 0.001, 2.9, -2, 1]], np.float32)
+    check_reach(np.concatenate([radians, 2 * radians]), stats, "a state")
+    assert not recwarn
+    for _ in range(2):
+        check_reach(np.rad2deg(radians), stats, "a state")
+    (warning,) = recwarn
+    assert "6 of 8 numbers" in str(warning.message)
+    assert "number 6 with 166.2 in place of at most 3" in str(warning.message)
+
+
 @pytest.mark.parametrize("goal", [None, b"pick", "pick \udfff"])
 def test_an_episode_begins_with_a_goal_in_words(goal: object) -> None:
     from mme_vla.testing.small import small_policy
