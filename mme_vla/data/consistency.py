@@ -33,7 +33,7 @@ from mme_vla.data.lerobot_files import (
     read_records,
     read_tasks,
 )
-from mme_vla.errors import UserError, brief, counted, listed, require
+from mme_vla.errors import UserError, brief, counted, require
 from mme_vla.utils import read_json
 
 log = logging.getLogger(__name__)
@@ -346,35 +346,3 @@ def have_other_units(first: np.ndarray, second: np.ndarray) -> bool:
     moving = (first > 0) & (second > 0)
     apart = np.abs(np.log(first[moving] / second[moving])) >= np.log(UNITS_APART)
     return bool(2 * apart.sum() > len(apart))
-
-
-def named_alike(name: str) -> str:
-    """A number's name as names are compared: `Joint_1` is `joint 1`."""
-    return "".join(letter for letter in name.casefold() if letter.isalnum())
-
-
-def compare_names(
-    first: Sequence[str],
-    second: Sequence[str],
-    what: str,
-    of_first: str,
-    of_second: str,
-    same_place: str,
-) -> None:
-    """Compare the names of the same numbers in two places; empty where one has none.
-
-    Raises:
-        UserError: the same names in another order: numbers would be exchanged.
-    """
-    if not first or not second:
-        return
-    compared_first = [named_alike(name) for name in first]
-    compared_second = [named_alike(name) for name in second]
-    if compared_first == compared_second:
-        return
-    both = f"{of_first}: {listed(first, 24)}; {of_second}: {listed(second, 24)}"
-    if sorted(compared_first) == sorted(compared_second):
-        raise UserError(
-            f"The numbers of the {what} have the same names in another order. {both}. {same_place}"
-        )
-    log.warning("The numbers of the %s have different names. %s.", what, both)

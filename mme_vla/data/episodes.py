@@ -16,7 +16,6 @@ import numpy as np
 
 from mme_vla.data.consistency import (
     check_consistency,
-    compare_names,
     compare_stats,
     compare_units,
     have_other_units,
@@ -42,7 +41,7 @@ from mme_vla.data.lerobot_files import (
 from mme_vla.data.video import VideoReader, video_file
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
-from mme_vla.embodiment.action_space import numbered, read_options
+from mme_vla.embodiment.action_space import compare_names, read_options
 from mme_vla.errors import UserError, brief, counted, did_you_mean, listed, require
 from mme_vla.utils import Sums, decoding
 
@@ -462,12 +461,9 @@ class EpisodeSource:
         """Compare the names of numbers: the dataset's with the robot's, and of states with actions
         relative to them.
         """
-        axes = robot.action.names
-        if axes == numbered(robot.action.width):
-            axes = ()
         compare_names(
             self.action_names,
-            axes,
+            robot.action.names,
             "action",
             f"the dataset {self.name}",
             f"the robot {robot.name}",

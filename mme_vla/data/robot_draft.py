@@ -40,7 +40,7 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
     """Write the YAML file of the robot that a dataset is of.
 
     Cameras, widths, names and rate are the dataset's. Guessed, and marked so: the camera that feeds
-    memory, cameras that move with a hand (by their names), numbers that are relative to the state
+    memory, columns that are joined, cameras that move with a hand (by their names), numbers that are relative to the state
     (those that state and action call the same, without grippers), and the length of chunks.
 
     Args:
@@ -127,15 +127,16 @@ def _cameras(features: Mapping[str, Feature]) -> dict[str, str]:
 def _vectors(
     features: Mapping[str, Feature], defaults: Sequence[str], prefix: str
 ) -> tuple[str, ...]:
-    """The columns that are the state or the action: the usual one, else all vectors of floats whose
-    names begin alike.
+    """The columns that are the state or the action: the usual one, else all numbers whose names
+    begin alike.
     """
     for column in defaults:
         if column in features and features[column].width:
             return (column,)
     columns = []
     for column, feature in features.items():
-        is_vector = feature.width and feature.dtype.startswith("float")
+        # A gripper is often a flag or a whole number beside the joints.
+        is_vector = feature.width and feature.dtype.startswith(("float", "int", "uint", "bool"))
         if is_vector and column.startswith(prefix) and column not in SUBGOALS:
             columns.append(column)
     return tuple(columns)
@@ -166,7 +167,7 @@ def _camera_lines(name: str, column: str, feature: Feature) -> list[str]:
 def _key_lines(columns: Sequence[str], defaults: Sequence[str]) -> list[str]:
     if len(columns) == 1 and columns[0] in defaults:
         return []
-    return [f"  key: [{', '.join(map(_text, columns))}]"]
+    return [f"  key: [{', '.join(map(_text, columns))}] # {CHECK} the columns that are joined"]
 
 
 def _text(value: str) -> str:

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from mme_vla.config.sections import PathText, read_section
-from mme_vla.data.consistency import compare_names, have_other_units
+from mme_vla.data.consistency import have_other_units
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment.action_space import compare_names
 from mme_vla.errors import UserError, listed, require
 
 log = logging.getLogger(__name__)

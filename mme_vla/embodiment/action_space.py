@@ -1,5 +1,6 @@
 """`ActionSpace`: what the numbers of an action mean, as recorded, as predicted and as commanded."""
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,11 +19,13 @@ from pydantic import (
 from pydantic.dataclasses import dataclass as checked_dataclass
 from pydantic_core import PydanticUseDefault
 
-from mme_vla.errors import LARGEST, UserError, brief, require
+from mme_vla.errors import LARGEST, UserError, brief, listed, require
 from mme_vla.utils.validation import validated
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+log = logging.getLogger(__name__)
 
 
 def _as_list(value: Any) -> Any:
@@ -374,6 +377,39 @@ class ActionSpace:
 def numbered(width: int) -> tuple[str, ...]:
     """Names for numbers that have none."""
     return tuple(f"number {i + 1}" for i in range(width))
+
+
+def named_alike(name: str) -> str:
+    """A number's name as names are compared: `Joint_1` is `joint 1`."""
+    return "".join(letter for letter in name.casefold() if letter.isalnum())
+
+
+def compare_names(
+    first: Sequence[str],
+    second: Sequence[str],
+    what: str,
+    of_first: str,
+    of_second: str,
+    same_place: str,
+) -> None:
+    """Compare the names of the same numbers in two places; empty or `numbered` where one has none.
+
+    Raises:
+        UserError: the same names in another order: numbers would be exchanged.
+    """
+    unnamed = ((), numbered(len(first)))
+    if tuple(first) in unnamed or tuple(second) in unnamed:
+        return
+    compared_first = [named_alike(name) for name in first]
+    compared_second = [named_alike(name) for name in second]
+    if compared_first == compared_second:
+        return
+    both = f"{of_first}: {listed(first, 24)}; {of_second}: {listed(second, 24)}"
+    if sorted(compared_first) == sorted(compared_second):
+        raise UserError(
+            f"The numbers of the {what} have the same names in another order. {both}. {same_place}"
+        )
+    log.warning("The numbers of the %s have different names. %s.", what, both)
 
 
 def _require(options: Sequence[Option]) -> None:

@@ -3,6 +3,7 @@
 One YAML of `configs/embodiment` describes one; it is saved with every checkpoint.
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Self
@@ -10,10 +11,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, StrictBool
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from mme_vla.embodiment.action_space import ActionSpace, Columns, Size
+from mme_vla.embodiment.action_space import ActionSpace, Columns, Size, compare_names
 from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.utils.validation import validated
 
+log = logging.getLogger(__name__)
 _STRICT = ConfigDict(extra="forbid")
 
 
@@ -193,3 +195,41 @@ class Embodiment:
             f"embodiment.action.horizon={self.action.horizon} and backbone.horizon={horizon} are"
             " the same length of a chunk: set the embodiment's, which the backbone follows.",
         )
+
+    def check_place(self, local: Self) -> None:
+        """Make sure that a policy of this robot can act where there is another, `local`.
+
+        Raises:
+            UserError: a camera that is not there, another number of numbers, or their names in
+                another order.
+        """
+        described = []
+        for robot in (self, local):
+            described.append(
+                f"{robot.name!r} with the cameras {', '.join(robot.camera_names)},"
+                f" {robot.state.width} numbers of state and {robot.action.width} of an action"
+            )
+        require(
+            set(self.camera_names) <= set(local.camera_names)
+            and self.state.width == local.state.width
+            and self.action.width == local.action.width,
+            f"The robot of this policy, {described[0]}, does not fit the environment's,"
+            f" {described[1]}. Train with env=<this environment>.",
+        )
+        compare_names(
+            self.action.names,
+            local.action.names,
+            "action",
+            f"the policy's robot {self.name}",
+            f"the environment's {local.name}",
+            "Bring the environment's embodiment into the order that the policy was trained in.",
+        )
+        if None not in (self.fps, local.fps) and self.fps != local.fps:
+            log.warning(
+                "The policy's robot %s has %g frames per second, the environment's %s has %g: one"
+                " action is another time.",
+                self.name,
+                self.fps,
+                local.name,
+                local.fps,
+            )

@@ -180,23 +180,8 @@ class Environment(ABC):
 
     def check_embodiment(self, robot: Embodiment) -> None:
         """Make sure that a policy with this robot can be evaluated here."""
-        if self.embodiment is None:
-            return
-        local = Embodiment.from_dict(self.embodiment)
-        misfits = []
-        if set(robot.camera_names) - set(local.camera_names):
-            misfits.append("cameras")
-        if robot.state.width != local.state.width:
-            misfits.append("numbers of the state")
-        if robot.action.width != local.action.width:
-            misfits.append("numbers of an action")
-        require(
-            not misfits,
-            f"The robot {robot.name!r} of this policy does not fit the environment's"
-            f" {local.name!r}, which has the cameras {', '.join(local.camera_names)},"
-            f" {local.state.width} numbers of state and {local.action.width} of an action"
-            f" ({', '.join(misfits)}). Train with env=<this environment>.",
-        )
+        if self.embodiment is not None:
+            robot.check_place(Embodiment.from_dict(self.embodiment))
 
     def episode(self, task: str, split: str, number: int) -> EpisodeSpec:
         """One episode of a split."""

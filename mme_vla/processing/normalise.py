@@ -368,7 +368,7 @@ class RunningStats:
 # by that
 REACH = 100
 # multiples of the largest value in training; degrees in place of radians are 57 times as large
-FAR = 10
+OTHER_UNIT = 10
 
 
 def finite_array(values: object, what: str) -> np.ndarray:
@@ -407,12 +407,12 @@ def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> N
     trained = np.maximum(np.abs(stats.q01), np.abs(stats.q99))
     reached = np.abs(values).reshape(-1, len(stats)).max(axis=0, initial=0)
     times = reached / np.maximum(trained, 1e-3)
-    if (times > FAR).mean() > 0.25:
+    if (times > OTHER_UNIT).mean() > 0.25:
         d = int(times.argmax())
         warn_once(
-            f"{what} has {(times > FAR).sum()} of {len(stats)} numbers more than {FAR} times as"
-            f" large as any in the training data, such as number {d + 1} with {reached[d]:.4g} in"
-            f" place of at most {trained[d]:.4g}. Check the units: degrees and radians differ by"
-            " 57.",
-            key=(FAR, trained.tobytes()),
+            f"{what} has {(times > OTHER_UNIT).sum()} of {len(stats)} numbers more than"
+            f" {OTHER_UNIT} times as large as any in the training data, such as number {d + 1} with"
+            f" {reached[d]:.4g} in place of at most {trained[d]:.4g}. Check the units: degrees and"
+            " radians differ by 57.",
+            key=(OTHER_UNIT, trained.tobytes()),
         )

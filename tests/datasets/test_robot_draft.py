@@ -81,6 +81,24 @@ def test_unusual_columns_are_named() -> None:
     assert set(columns.cameras.values()) == {"images.head", "state"}
 
 
+def test_a_gripper_of_whole_numbers_or_flags_is_among_the_joined_columns() -> None:
+    single = {"shape": [1], "names": None}
+    info = info_of(
+        **{
+            "observation.images.top": IMAGE,
+            "observation.state.arm": vector(width=6),
+            "observation.state.gripper": {"dtype": "uint8", **single},
+            "action.arm": vector(width=6),
+            "action.gripper": {"dtype": "bool", **single},
+        }
+    )
+    draft = drafted(info)
+    robot = robot_of(draft)
+    assert robot.state.key == ("observation.state.arm", "observation.state.gripper")
+    assert robot.action.key == ("action.arm", "action.gripper") and robot.action.width == 7
+    assert sum(line.startswith("key:") for line in draft.open_lines) == 2
+
+
 def test_a_folder_with_the_name_of_a_value_gives_a_name() -> None:
     info = info_of(top=IMAGE, observation__state=vector(width=2), action=vector(width=2))
     for folder in ("null", "True"):

@@ -197,3 +197,34 @@ def test_a_single_number_may_stand_without_a_list_and_is_checked_all_the_same(
     for wrong in (None, math.nan, math.inf):
         with pytest.raises(UserError, match="row 1 has gripper"):
             check_vectors(tmp_path, Table(0.5, wrong), "gripper", 1)
+
+
+def named(**changes: Any) -> Embodiment:
+    names = [*(f"joint {i}" for i in range(1, 8)), "gripper"]
+    return Embodiment.from_dict({**action(names=names), "fps": 30.0, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            action(names=["gripper", *(f"joint {i}" for i in range(1, 8))]),
+            "same names in another order",
+        ),
+        ({"state": {"width": 9}}, r"8 numbers of state .* does not fit .* 9 numbers of state"),
+        ({"cameras": {"front": None}}, "with the cameras front, wrist.*with the cameras front,"),
+    ],
+)
+def test_a_policy_acts_only_where_the_robot_has_its_cameras_and_numbers(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        named().check_place(named(**changes))
+
+
+def test_another_rate_of_the_environment_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    named().check_place(named())
+    named().check_place(named(fps=None))
+    assert not caplog.records
+    named().check_place(named(fps=10.0))
+    assert "has 30 frames per second, the environment's robomme_joint has 10" in caplog.text
