@@ -40,8 +40,9 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
     """Write the YAML file of the robot that a dataset is of.
 
     Cameras, widths, names and rate are the dataset's. Guessed, and marked so: the camera that feeds
-    memory, columns that are joined, cameras that move with a hand (by their names), numbers that are relative to the state
-    (those that state and action call the same, without grippers), and the length of chunks.
+    memory, columns that are joined, cameras that move with a hand (by their names), numbers that
+    are relative to the state (those that state and action call the same, without grippers), and
+    the length of chunks.
 
     Args:
         root: of the dataset; its folder's name becomes the robot's.

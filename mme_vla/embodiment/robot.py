@@ -203,18 +203,15 @@ class Embodiment:
             UserError: a camera that is not there, another number of numbers, or their names in
                 another order.
         """
-        described = []
-        for robot in (self, local):
-            described.append(
-                f"{robot.name!r} with the cameras {', '.join(robot.camera_names)},"
-                f" {robot.state.width} numbers of state and {robot.action.width} of an action"
-            )
         require(
             set(self.camera_names) <= set(local.camera_names)
             and self.state.width == local.state.width
             and self.action.width == local.action.width,
-            f"The robot of this policy, {described[0]}, does not fit the environment's,"
-            f" {described[1]}. Train with env=<this environment>.",
+            f"The robot {self.name!r} of this policy, with the cameras"
+            f" {', '.join(self.camera_names)}, {self.state.width} numbers of state and"
+            f" {self.action.width} of an action, does not fit the environment's {local.name!r},"
+            f" which has the cameras {', '.join(local.camera_names)}, {local.state.width} numbers"
+            f" of state and {local.action.width} of an action. Train with env=<this environment>.",
         )
         compare_names(
             self.action.names,

@@ -405,14 +405,12 @@ def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> N
         )
     # Other units make most numbers larger that are not near zero; some are at any time.
     trained = np.maximum(np.abs(stats.q01), np.abs(stats.q99))
-    reached = np.abs(values).reshape(-1, len(stats)).max(axis=0, initial=0)
-    times = reached / np.maximum(trained, 1e-3)
+    largest = np.abs(values).reshape(-1, len(stats)).max(axis=0, initial=0)
+    times = largest / np.maximum(trained, 1e-3)
     if (times > OTHER_UNIT).mean() > 0.25:
-        d = int(times.argmax())
         warn_once(
             f"{what} has {(times > OTHER_UNIT).sum()} of {len(stats)} numbers more than"
-            f" {OTHER_UNIT} times as large as any in the training data, such as number {d + 1} with"
-            f" {reached[d]:.4g} in place of at most {trained[d]:.4g}. Check the units: degrees and"
-            " radians differ by 57.",
+            f" {OTHER_UNIT} times as large as any in the training data (up to {times.max():.0f}"
+            " times). Check the units: degrees and radians differ by 57.",
             key=(OTHER_UNIT, trained.tobytes()),
         )
