@@ -299,11 +299,6 @@ class RunningStats:
         self._edges = self._counts = empty  # [d, BINS + 1] and [d, BINS]
         self._magnitudes: list[_Magnitudes] = []  # [d]
 
-    @property
-    def count(self) -> int:
-        """How many rows went in."""
-        return self._count
-
     def update(self, batch: np.ndarray) -> None:
         """Add rows [..., d]."""
         rows = np.asarray(batch, dtype=np.float64)
