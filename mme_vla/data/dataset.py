@@ -1,5 +1,6 @@
 """The training dataset: one item is one step of an execution phase."""
 
+import logging
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ from mme_vla.processing.base import collate as collate
 from mme_vla.processing.images import past_views
 from mme_vla.processing.prompt import SubgoalText
 from mme_vla.types import labels_read
+
+log = logging.getLogger(__name__)
 
 TRANSFORMS = 1  # The stream of random numbers of an item that transforms read
 
@@ -172,6 +175,15 @@ class TrainingDataset(Dataset[dict[str, Any]]):
                 for name in source.subgoal_names:
                     if name.startswith(subgoal.kind):
                         text_column(source, name, f"subgoal_text.kind={subgoal.kind}")
+                online = f"{subgoal.kind}_online"
+                if subgoal.online_probability and online not in source.subgoal_names:
+                    log.warning(
+                        "%s has no column %s: all its subgoals are the planner's, and"
+                        " subgoal_text.online_probability=%g has no effect.",
+                        source.name,
+                        online,
+                        subgoal.online_probability,
+                    )
         rate = processor.embodiment.fps
         if processor.samples.history is not None and rate is not None:
             for source in sources:

@@ -42,7 +42,7 @@ from mme_vla.data.video import VideoReader, video_file
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import compare_names, read_options
-from mme_vla.errors import UserError, brief, did_you_mean, listed, require
+from mme_vla.errors import UserError, brief, counted, did_you_mean, listed, require
 from mme_vla.utils import Sums, decoding
 
 log = logging.getLogger(__name__)
@@ -183,6 +183,10 @@ class EpisodeSource:
 
     def __len__(self) -> int:
         return len(self.lengths)
+
+    def __repr__(self) -> str:
+        frames = counted(int(self.lengths.sum()), "frame")
+        return f"EpisodeSource({self.name!r}, {counted(len(self), 'episode')}, {frames})"
 
     @cached_property
     def fingerprint(self) -> str:

@@ -58,13 +58,14 @@ def test_half_of_the_texts_are_the_online_ones():
     assert SubgoalText("simple_subgoal", online_probability=0)(TEXTS, rng) == "put it down"
 
 
-def test_a_dataset_without_the_online_texts_trains_on_the_others():
+def test_a_dataset_without_the_online_texts_trains_on_the_others(caplog):
     source = EpisodeSource("sample")
     source.subgoal_names = ("simple_subgoal",)
     policy = build_policy("simplesg")
     policy.processor.stats = small_policy("pi05").processor.stats
     choose = SubgoalText.from_config(policy.config["subgoal_text"])
     data = TrainingDataset([source], policy.processor, subgoal=choose)
+    assert "has no column simple_subgoal_online" in caplog.text
     prompts = set()
     for epoch in range(8):
         data.set_epoch(epoch)
