@@ -15,7 +15,13 @@ from torch import Tensor
 from mme_vla.data.recording import SUBGOAL, stored_frames
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of
-from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
+from mme_vla.extras.probing.channels import (
+    Channel,
+    MemorySnapshot,
+    Remembered,
+    channel_of,
+    chosen_among,
+)
 from mme_vla.extras.probing.interventions import Moment
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.extras.probing.streams import Shown
@@ -420,7 +426,7 @@ class ProbedPolicy(Policy):
         now = max(episode.inner.n_observed_frames - 1, 0)
         stored = np.zeros(0, np.int64)
         if self.memory is not None:
-            stored = self.memory.storage.stored_frames(now + 1)
+            stored = chosen_among(self.memory.storage).stored_frames(now + 1)
         rng = np.random.default_rng([episode.seed, now, zlib.crc32(self.arm.name.encode())])
         exec_start = episode.n_observed_frames
         if episode.exec_start is not None:
