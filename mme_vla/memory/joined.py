@@ -210,7 +210,7 @@ class JoinedMemory(MemoryModule, ReadsLabels):
 
 
 class CoarserHistory(DerivedHistory):
-    """A history as a member reads it, which needs a coarser grid or fewer frames than are stored."""
+    """A history as a member reads it that needs a coarser grid, or fewer frames than are stored."""
 
     def __init__(self, source: History, spec: StorageSpec) -> None:
         super().__init__(source)
