@@ -57,7 +57,7 @@ def fingerprint(
         "preprocessing": PREPROCESSING,
         "view": source.columns[source.robot.memory_camera],
         "dtype": dtype,
-        "storage": spec.to_dict(),
+        "storage": asdict(spec),
         "dataset": {
             "content": source.fingerprint,
             "episodes": len(source),

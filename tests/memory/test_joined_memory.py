@@ -87,17 +87,17 @@ def test_a_member_finds_the_frames_that_it_keeps_however_many_the_others_do() ->
     sparse, dense = memory.memories
     assert memory.storage.keep_every == 1
     history = Episode(memory, 20).cached()
-    seen: dict[Any, list[int]] = {}
+    stored: dict[Any, list[int]] = {}
     for member in memory.memories:
 
         def note(view: Any, step: int, rng: Any = None, member: Any = member) -> np.ndarray:
-            seen[member] = view.stored_frames.tolist()
+            stored[member] = view.stored_frames.tolist()
             return np.array([[0, 0]])
 
         member.select = note  # type: ignore[method-assign]
     memory.gather_selection(history, 19)
-    assert seen[sparse] == [0, 3, 7, 11, 15, 19]
-    assert seen[dense] == list(range(20))
+    assert stored[sparse] == [0, 3, 7, 11, 15, 19]
+    assert stored[dense] == list(range(20))
 
 
 @torch.no_grad()

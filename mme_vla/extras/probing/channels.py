@@ -88,7 +88,7 @@ class Remembered:
 Place = tuple[History, int]  # A frame of a history
 
 
-def chosen_among(spec: StorageSpec) -> StorageSpec:
+def selectable(spec: StorageSpec) -> StorageSpec:
     """Which frames a memory chooses among: the stored ones; all of them where it stores none, and
     reads states and actions.
     """
@@ -105,10 +105,10 @@ class OnlyFrames(History):
     """
 
     def __init__(self, full: History, frames: np.ndarray) -> None:
-        """Take frames [m] of `chosen_among`, ascending, at least one; the last means the current
+        """Take frames [m] of `selectable`, ascending, at least one; the last means the current
         one.
         """
-        spec = chosen_among(full.spec)
+        spec = selectable(full.spec)
         every = spec.keep_every
         self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
         self._stored = spec.stored_frames(self._length)

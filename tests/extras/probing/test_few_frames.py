@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from mme_vla.extras.probing.channels import channel_of, chosen_among
+from mme_vla.errors import UserError
+from mme_vla.extras.probing.arms import read_arm
+from mme_vla.extras.probing.channels import channel_of, selectable
+from mme_vla.extras.probing.probed import ProbedPolicy
 from mme_vla.memory.history import FrameScores
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
@@ -50,7 +53,7 @@ def test_a_choice_among_all_frames_changes_nothing(name: str) -> None:
     """States and actions are those of all frames, also where no frame has tokens."""
     policy = small_policy(name).eval()
     episode = running(policy)
-    frames = chosen_among(policy.require_memory().storage).stored_frames(LENGTH)
+    frames = selectable(policy.require_memory().storage).stored_frames(LENGTH)
     batch = policy.observation([episode])
     noise = stack_noise([policy.sampling_noise(torch.Generator().manual_seed(0))])
     expected = policy.predict_chunk(batch, [episode], noise)
@@ -61,16 +64,16 @@ def test_a_choice_among_all_frames_changes_nothing(name: str) -> None:
     assert not torch.allclose(some, expected, atol=1e-5)
 
 
-def test_the_first_of_the_chosen_frames_has_a_score_where_that_of_an_episode_has_one() -> None:
+def test_the_first_of_few_frames_has_a_score_where_that_of_an_episode_has_one() -> None:
     policy = small_policy("tokendrop_modul")
     history: Any = running(policy).history
-    chosen = np.array([15, 23, 39])
+    frames_left = np.array([15, 23, 39])
 
     def scored(first: int) -> list[int]:
         frames = np.append(first, np.arange(15, 40, 8))
         rows = np.zeros((len(frames), 64), np.float32)
         history._scored_frames, history._score_rows = frames.tolist(), list(rows)
-        view = channel_of(policy).read(Told(history), only=chosen).source[0]
+        view = channel_of(policy).read(HistoryOnly(history), only=frames_left).source[0]
         scores: FrameScores = view.scores
         return scores.frames.tolist()
 
@@ -78,7 +81,22 @@ def test_the_first_of_the_chosen_frames_has_a_score_where_that_of_an_episode_has
     assert scored(7) == [7, 15]
 
 
-class Told:
+def test_a_chunk_that_is_not_finite_is_reported_before_it_is_recorded() -> None:
+    policy = small_policy("framesamp_modul").eval()
+    probe = ProbedPolicy(policy, read_arm("drop:all"))
+    episode = probe.start_episode("pick up the cube")
+    frames = moving_frames(4, 64)
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((4, 8), np.float32))
+    snapshot, stores = probe.snapshot(episode)
+    sampled = policy.sampling_noise(torch.Generator())
+    assert probe.ask(episode, snapshot, [stores], [sampled]).isfinite().all()
+    with torch.no_grad():
+        next(policy.integration.parameters()).fill_(float("nan"))
+    with pytest.raises(UserError, match=r"drop:all: a chunk is not finite\. What reads"):
+        probe.ask(episode, snapshot, [stores], [sampled])
+
+
+class HistoryOnly:
     """An episode of which only the history is read."""
 
     def __init__(self, history: Any) -> None:
