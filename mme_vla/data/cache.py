@@ -9,6 +9,7 @@ is refused, never read and never replaced unless asked to.
 
 import re
 from collections import OrderedDict
+from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
 from typing import Any

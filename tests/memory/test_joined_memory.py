@@ -94,7 +94,7 @@ def test_a_member_finds_the_frames_that_it_keeps_however_many_the_others_do() ->
             stored[member] = view.stored_frames.tolist()
             return np.array([[0, 0]])
 
-        member.select = note  # type: ignore[method-assign]
+        member.select = note  # type: ignore[assignment, method-assign]
     memory.gather_selection(history, 19)
     assert stored[sparse] == [0, 3, 7, 11, 15, 19]
     assert stored[dense] == list(range(20))

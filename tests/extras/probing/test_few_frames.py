@@ -66,14 +66,15 @@ def test_a_choice_among_all_frames_changes_nothing(name: str) -> None:
 
 def test_the_first_of_few_frames_has_a_score_where_that_of_an_episode_has_one() -> None:
     policy = small_policy("tokendrop_modul")
-    history: Any = running(policy).history
+    episode: Any = running(policy)
+    history = episode.history
     frames_left = np.array([15, 23, 39])
 
     def scored(first: int) -> list[int]:
         frames = np.append(first, np.arange(15, 40, 8))
         rows = np.zeros((len(frames), 64), np.float32)
         history._scored_frames, history._score_rows = frames.tolist(), list(rows)
-        view = channel_of(policy).read(HistoryOnly(history), only=frames_left).source[0]
+        view = channel_of(policy).read(episode, only=frames_left).source[0]
         scores: FrameScores = view.scores
         return scores.frames.tolist()
 
@@ -94,13 +95,3 @@ def test_a_chunk_that_is_not_finite_is_reported_before_it_is_recorded() -> None:
         next(policy.integration.parameters()).fill_(float("nan"))
     with pytest.raises(UserError, match=r"drop:all: a chunk is not finite\. What reads"):
         probe.ask(episode, snapshot, [stores], [sampled])
-
-
-class HistoryOnly:
-    """An episode of which only the history is read."""
-
-    def __init__(self, history: Any) -> None:
-        self._history = history
-
-    def required_history(self) -> Any:
-        return self._history
