@@ -9,6 +9,7 @@ is refused, never read and never replaced unless asked to.
 
 import re
 from collections import OrderedDict
+from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def fingerprint(
         "preprocessing": PREPROCESSING,
         "view": source.columns[source.robot.memory_camera],
         "dtype": dtype,
-        "storage": spec.to_dict(),
+        "storage": asdict(spec),
         "dataset": {
             "content": source.fingerprint,
             "episodes": len(source),

@@ -10,8 +10,7 @@ import inspect
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -52,9 +51,6 @@ class StorageSpec:
         """Ascending indices of the stored frames among the first `length`."""
         frames = np.arange(length)
         return frames[on_interval(frames, self.keep_every)]
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 FORMER_KEYS: dict[str, str] = {}

@@ -24,6 +24,7 @@ from mme_vla.memory.history import (
     History,
     PromptConditionedHistory,
     StorageSpec,
+    on_interval,
 )
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens, ReadsLabels, labels_read
@@ -209,11 +210,16 @@ class JoinedMemory(MemoryModule, ReadsLabels):
 
 
 class CoarserHistory(DerivedHistory):
-    """A history as a member reads it that needs a coarser grid than is stored."""
+    """A history as a member reads it that needs a coarser grid, or fewer frames than are stored."""
 
     def __init__(self, source: History, spec: StorageSpec) -> None:
         super().__init__(source)
         self.spec = spec
+
+    @property
+    def stored_frames(self) -> np.ndarray:
+        stored = self._source.stored_frames
+        return stored[on_interval(stored, self.spec.keep_every)]
 
     @property
     def scores(self) -> FrameScores:

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from mme_vla.errors import require
-from mme_vla.memory.history import FrameScores, History
+from mme_vla.memory.history import DerivedHistory, FrameScores, History
 from mme_vla.memory.perturbation import Perturbation
 
 
@@ -77,16 +77,15 @@ def map_frames(
     return FrameMap(real, int(np.searchsorted(real, exec_start)), transforms, rng)
 
 
-class TransformedHistory(History):
+class TransformedHistory(DerivedHistory):
     """A history as transforms show it. A frame without tokens is replaced by the newest stored one
     before it.
     """
 
     def __init__(self, source: History, frames: FrameMap) -> None:
-        super().__init__(source.spec, frames.exec_start)
-        self._source = source
+        super().__init__(source)
+        self.exec_start = frames.exec_start
         self._frames = frames
-        self.state_width = source.state_width
         if source.motion is not None:
             self.motion = self._motion
 

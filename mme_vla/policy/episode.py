@@ -76,6 +76,8 @@ class Episode:
         """State of a streaming memory between two `act`s."""
         self.read: History | None = None
         """The history as the last `act` read it, conditioned on the prompt."""
+        self.read_prompt: Tensor | None = None
+        """Token ids of that prompt, where a backbone conditions on it."""
         self._past: PastImages | None = None
         self._motion_of_frames: list[Tensor] = []
         """Rows [w], one a frame, if the memory reads motion."""

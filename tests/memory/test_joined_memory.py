@@ -81,6 +81,25 @@ def test_every_member_replies_as_when_alone(members: list[Any]) -> None:
     assert start == memory.budget == tokens.tokens.shape[1] <= 512
 
 
+def test_a_member_finds_the_frames_that_it_keeps_however_many_the_others_do() -> None:
+    """`history.stored_frames` is that of the member alone, also where others keep every frame."""
+    memory = joined([{**FRAMES, "every": 4}, TTT])
+    sparse, dense = memory.memories
+    assert memory.storage.keep_every == 1
+    history = Episode(memory, 20).cached()
+    stored: dict[Any, list[int]] = {}
+    for member in memory.memories:
+
+        def note(view: Any, step: int, rng: Any = None, member: Any = member) -> np.ndarray:
+            stored[member] = view.stored_frames.tolist()
+            return np.array([[0, 0]])
+
+        member.select = note  # type: ignore[assignment, method-assign]
+    memory.gather_selection(history, 19)
+    assert stored[sparse] == [0, 3, 7, 11, 15, 19]
+    assert stored[dense] == list(range(20))
+
+
 @torch.no_grad()
 def test_the_prompt_conditions_the_same_tokens_in_training_and_in_an_episode() -> None:
     """A member of a coarser grid reads pooled tokens, and the prompt changes these."""

@@ -227,6 +227,34 @@ def test_memory_tokens_of_episodes_are_read_with_their_prompts(
     assert not torch.equal(tokens, before.tokens[valid])
 
 
+@torch.no_grad()
+def test_a_stream_begins_anew_where_another_prompt_changes_the_tokens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A new subgoal or other options: all that is remembered is read with them, as in training."""
+    policy = small_policy("ttt_context").eval()
+
+    def with_prompt(
+        self: Any, tokens: torch.Tensor, prompt: torch.Tensor, prompt_mask: torch.Tensor
+    ) -> torch.Tensor:
+        return tokens + (prompt * prompt_mask).sum(1)[:, None, None] / 1000
+
+    monkeypatch.setattr(type(policy.backbone), "condition_on_prompt", with_prompt)
+    episode = policy.start_episode("press the button", seed=0)
+    frames = moving_frames(16, size=policy.backbone.image_size)
+    updates = []
+    for goal in ("press the button", "press the button", "pick up the red cube"):
+        episode.goal = goal
+        episode.observe({"front": frames, "wrist": frames}, np.zeros((16, 8), np.float32))
+        memory = policy.encode_memories([episode])
+        batch = policy.observation([episode])
+        batch.history = selection_of(policy, episode)
+        expected = policy.model.memory_tokens(batch).tokens[memory.mask]
+        assert torch.allclose(memory.tokens[memory.mask], expected, atol=1e-5)
+        updates.append(episode.stream.updates)
+    assert updates == [1, 2, 3]  # one new frame each, and all of them under another prompt
+
+
 def selection_of(policy: MMEPolicy, episode: Any) -> Any:
     """The stored tokens of an episode that its memory reads now, as a batch of one."""
     history = episode.required_history()

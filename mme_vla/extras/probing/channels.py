@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from mme_vla.extras.methods.writable_memory import WritableMemory
-from mme_vla.memory.base import stack_history
-from mme_vla.memory.history import DerivedHistory, FrameScores, History
+from mme_vla.memory.base import NEVER, stack_history
+from mme_vla.memory.history import DerivedHistory, FrameScores, History, StorageSpec
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
@@ -88,6 +88,15 @@ class Remembered:
 Place = tuple[History, int]  # A frame of a history
 
 
+def selectable(spec: StorageSpec) -> StorageSpec:
+    """Which frames a memory chooses among: the stored ones; all of them where it stores none, and
+    reads states and actions.
+    """
+    if spec.keep_every == NEVER:
+        return replace(spec, keep_every=1)
+    return spec
+
+
 class OnlyFrames(History):
     """A history in which some stored frames follow one another as if there had been no others.
 
@@ -96,16 +105,17 @@ class OnlyFrames(History):
     """
 
     def __init__(self, full: History, frames: np.ndarray) -> None:
-        """Take the stored frames `frames` [m], ascending, at least one; the last means the current
+        """Take frames [m] of `selectable`, ascending, at least one; the last means the current
         one.
         """
-        every = full.spec.keep_every
+        spec = selectable(full.spec)
+        every = spec.keep_every
         self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
-        self._stored = full.spec.stored_frames(self._length)
+        self._stored = spec.stored_frames(self._length)
         self.frames = dict(zip(self._stored.tolist(), frames.tolist(), strict=True))
         earlier = int((frames < full.exec_start).sum())
         super().__init__(
-            full.spec, int(self._stored[earlier]) if earlier < len(frames) else self._length
+            spec, int(self._stored[earlier]) if earlier < len(frames) else self._length
         )
         self._full_history = full
         if full.motion is not None:
@@ -132,8 +142,8 @@ class OnlyFrames(History):
         frames = []
         rows = []
         for mine, its in self.frames.items():
-            # The first frame is remembered whatever its score, as that of an episode is.
-            if mine and its in row_of:
+            # The first frame has a score only where that of an episode has one.
+            if its in row_of and (mine or 0 in row_of):
                 frames.append(mine)
                 rows.append(row_of[its])
         return FrameScores(np.array(frames, np.int64), full.values[rows])
@@ -271,7 +281,8 @@ class SelectionChannel(Channel):
         self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]
     ) -> HistoryTokens:
         view, at, frames = snapshot.source
-        slots = dict(zip(frames, stores[0].entries, strict=True))
+        (store,) = stores
+        slots = dict(zip(frames, store.entries, strict=True))
         places = {frame: entry.content for frame, entry in slots.items() if entry is not None}
         tokens = self._memory.gather_selection(Exchanged(view, places), at)
         positions, mask = tokens.positions.clone(), tokens.mask.clone()
@@ -284,7 +295,7 @@ class SelectionChannel(Channel):
             tokens.features.masked_fill(~mask_3d, 0),
             positions.masked_fill(~mask_3d, 0),
             mask,
-            tokens.step,
+            torch.tensor(store.now),  # among `only` some frames the view counts these alone
         )
 
     def predict_chunk(

@@ -13,9 +13,15 @@ import torch
 from torch import Tensor
 
 from mme_vla.data.recording import SUBGOAL, stored_frames
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of
-from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
+from mme_vla.extras.probing.channels import (
+    Channel,
+    MemorySnapshot,
+    Remembered,
+    channel_of,
+    selectable,
+)
 from mme_vla.extras.probing.interventions import Moment
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.extras.probing.streams import Shown
@@ -420,7 +426,7 @@ class ProbedPolicy(Policy):
         now = max(episode.inner.n_observed_frames - 1, 0)
         stored = np.zeros(0, np.int64)
         if self.memory is not None:
-            stored = self.memory.storage.stored_frames(now + 1)
+            stored = selectable(self.memory.storage).stored_frames(now + 1)
         rng = np.random.default_rng([episode.seed, now, zlib.crc32(self.arm.name.encode())])
         exec_start = episode.n_observed_frames
         if episode.exec_start is not None:
@@ -483,6 +489,11 @@ class ProbedPolicy(Policy):
             observation = self.inner.observation([episode.inner] * len(part))
             stacked = stack_noise(noises[start : start + batch])
             chunk = self.channel.predict_chunk(observation, part, stacked, steps)
+            require(
+                bool(chunk.isfinite().all()),
+                f"{self.arm.name}: a chunk is not finite. What reads the memory must also work"
+                " where no token is left (`drop:all`): divide by mask.sum(1).clamp(min=1).",
+            )
             chunks.append(chunk.float().cpu())
         action = self.embodiment.action
         stacked_chunks = torch.cat(chunks).unflatten(0, (len(variants), len(draws)))
