@@ -117,9 +117,9 @@ def evaluate_one(run: EvaluateCommand, training: str = "") -> None:
     environment(settings.env).check_embodiment(policy.embodiment)
     prepare_sampling(policy, run.sampling, logger)
     subgoals = choose_subgoals(policy, run.subgoal, run.subgoal_mode, device)
-    predictor = None
+    subgoal = None
     if subgoals is not None and run.subgoal is not None:
-        predictor = str(run.subgoal["name"])
+        subgoal = str(run.subgoal["name"])
     if not settings.render:
         logger.warning(
             "render=false: the policy sees black images; only the time of the simulation means"
@@ -150,7 +150,7 @@ def evaluate_one(run: EvaluateCommand, training: str = "") -> None:
             events,
             options,
             name=name,
-            predictor=predictor,
+            subgoal=subgoal,
             output=run.output,
             training=training,
         )

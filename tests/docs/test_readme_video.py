@@ -15,8 +15,8 @@ SIDE = readme_video.SIDE
 def test_the_front_cameras_image_is_cut_out_and_the_conditioning_video_bordered(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "episode.mp4"
-    video = EpisodeVideo(lambda outcome, goal: path)
+    path = tmp_path / "episode_success_go.mp4"
+    video = EpisodeVideo(tmp_path, "episode")
     front, wrist = (np.full((SIDE, SIDE, 3), colour, np.uint8) for colour in (GREEN, BLUE))
     video.add([front, wrist], "go", demo=True)
     video.add([front, wrist], "go")

@@ -13,15 +13,15 @@ VIEWS = [[np.full((32, 48, 3), shade, np.uint8)] * 2 for shade in range(0, 240, 
 
 
 def video(folder: Path, keep: str = "all") -> EpisodeVideo:
-    return EpisodeVideo(lambda outcome, goal: folder / f"{outcome}.mp4", keep)
+    return EpisodeVideo(folder, "StopCube_ep3", keep)
 
 
 def test_frames_have_goal_and_caption_and_the_file_its_outcome(tmp_path: Path) -> None:
     recorder = video(tmp_path)
     for views in VIEWS:
         recorder.add(views, "a goal", "step 3")
-    path = recorder.finish("success", "")
-    assert path == tmp_path / "success.mp4"
+    path = recorder.finish("success", "press: the button!")
+    assert path == tmp_path / "StopCube_ep3_success_press_the_button.mp4"
     assert path.read_bytes() == video_bytes(video_frame(views, "a goal\nstep 3") for views in VIEWS)
 
 

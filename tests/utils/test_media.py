@@ -61,13 +61,11 @@ def test_an_episodes_video_shows_every_camera_of_the_robot(
     tmp_path: Path, names: tuple[str, ...]
 ) -> None:
     robot = replace(ROBOMME_JOINT, cameras=tuple(map(Camera, names)), memory_camera="side")
-    env = ChunkEnv(
-        ThreeCameras, video=EpisodeVideo(lambda outcome, goal: tmp_path / "a.mp4"), robot=robot
-    )
+    env = ChunkEnv(ThreeCameras, video=EpisodeVideo(tmp_path, "a"), robot=robot)
     env.reset()
     env.step(ChunkCommand(np.zeros((1, 8), np.float32)))
     env.close()
-    frames = decoded(tmp_path / "a.mp4")
+    frames = decoded(tmp_path / "a_success_go.mp4")
     side = 2 * BORDER
     assert len(frames) == 3 and frames[0].shape == (64 + side + 2 * CAPTION, 3 * 64 + side, 3)
     inside = [frames[2][BORDER + 24, BORDER + 64 * view + 32] for view in range(3)]

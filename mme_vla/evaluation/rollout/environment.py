@@ -30,7 +30,7 @@ from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.envs.subtasks import Progress, process_score
 from mme_vla.errors import require
-from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
+from mme_vla.evaluation.rollout.video import EpisodeVideo
 from mme_vla.registry import TASKS
 
 SUBGOAL = "simple_subgoal_online"
@@ -88,7 +88,7 @@ class Report:
         the first action.
     subtask: number of the execution's current sub-task from 1; 0 where the environment has none.
     began: frames at which sub-tasks began.
-    process: where the chain of sub-tasks broke, for the record.
+    process: where the chain of sub-tasks broke, once the episode is over.
     oracle: the action [w] that the task's script takes next, if it was requested.
     video: name of the finished video's file.
     simulated_s, rendered_s: seconds since the last report.
@@ -110,27 +110,6 @@ class Report:
     video: str | None = None
     simulated_s: float = 0.0
     rendered_s: float = 0.0
-
-
-@dataclass
-class StepOutcome:
-    """What one action led to.
-
-    info: the environment's, with the status of the outcome.
-    executed: 1 for an action, 0 for a hold or an action that failed.
-    frames: that it took.
-    """
-
-    info: Mapping[str, Any]
-    reward: float = 0.0
-    terminated: bool = False
-    truncated: bool = False
-    executed: int = 0
-    frames: int = 0
-
-    @property
-    def ends_episode(self) -> bool:
-        return self.terminated or self.truncated
 
 
 class RenderClock:
@@ -221,8 +200,7 @@ class ChunkEnv:
         frames = Frames(self._robot)
         count = frames.add(observation)
         self._note_pose(observation)
-        self._note_subgoal(info)
-        self._note_goal(info)
+        self._note_info(info)
         if self._video is not None:
             for number, views in enumerate(frames.newest(count), 1):
                 caption = f"conditioning video, frame {number} of {count - 1}"
@@ -246,70 +224,82 @@ class ChunkEnv:
             actions = list(np.asarray(command.actions))
         self._max_steps += command.hold
         frames = Frames(self._robot)
-        outcome = StepOutcome({})
-        executed = n_frames = 0
+        info: Mapping[str, Any] = {}
+        executed_before = self._executed
         total_reward = 0.0
+        terminated = truncated = False
         for number, action in enumerate(actions, 1):
             images = command.images
             if images is not None and number < len(actions):
                 # Only the chunk's last frame is the newest when the policy reads it.
                 images = replace(images, now=())
             self._request_images(images)
-            outcome = self._execute(action, frames, command.subgoal)
-            executed += outcome.executed
-            n_frames += outcome.frames
-            total_reward += outcome.reward
-            if outcome.ends_episode:
+            reward, terminated, truncated, info = self._execute(action, frames, command.subgoal)
+            total_reward += reward
+            if terminated or truncated:
                 break
         self._returned = frames.blank_unrequested(command.images, self._returned)
-        report = replace(self._report(outcome.info), executed=executed, frames=n_frames)
+        observation = frames.observation()
+        report = replace(
+            self._report(info),
+            executed=self._executed - executed_before,
+            frames=len(observation["state"]),
+        )
         if command.hold:
             report = replace(report, held=self._hold_action())
-        if outcome.ends_episode and self._video is not None:
+        if (terminated or truncated) and self._video is not None:
             path = self._video.finish(str(report.status), report.goal or "")
             if path is not None:
                 report = replace(report, video=path.name)
-        return frames.observation(), total_reward, outcome.terminated, outcome.truncated, report
+        return observation, total_reward, terminated, truncated, report
 
     def _execute(
         self, action: "np.ndarray | Hold", frames: "Frames", subgoal: str | None
-    ) -> StepOutcome:
-        """Execute one action, and add its frames."""
-        with self._simulation():
-            observation, reward, terminated, truncated, info = self._env.step(self._command(action))
-        outcome = StepOutcome(info, float(reward), bool(terminated), bool(truncated))
-        if info.get("status") == "error":
-            outcome.terminated = True
-            if is_out_of_reach(observation, info):
-                outcome.info = {**info, "status": "fail"}
-            return outcome
+    ) -> tuple[float, bool, bool, Mapping[str, Any]]:
+        """Execute one action, and add its frames; what a Gymnasium step returns after them."""
+        command: Any = action
         if not isinstance(action, Hold):
-            outcome.executed = 1
+            self._last = action
+            command = benchmark_action(self._robot.action, action, self._stick, self._pose)
+        with self._simulation():
+            observation, reward, terminated, truncated, info = self._env.step(command)
+        self._note_info(info)
+        if info.get("status") == "error":
+            if is_out_of_reach(observation, info):
+                info = {**info, "status": "fail"}
+            return float(reward), True, bool(truncated), info
+        if not isinstance(action, Hold):
             self._executed += 1
-        outcome.frames = frames.add(observation)
+        n_frames = frames.add(observation)
         self._note_pose(observation)
-        self._note_subgoal(info)
         # A choice that moves nothing takes time too, or it could continue for ever.
-        self._steps += max(outcome.frames, 1)
+        self._steps += max(n_frames, 1)
         is_last = self._executed == self._max_actions or self._steps > self._max_steps
-        if is_last and not outcome.ends_episode:
-            outcome.truncated = True
-            outcome.info = {**info, "status": "timeout"}
-        self._note_goal(info)
-        self._add_to_video(frames, outcome, subgoal)
-        return outcome
+        if is_last and not (terminated or truncated):
+            truncated = True
+            info = {**info, "status": "timeout"}
+        outcome = None
+        if terminated or truncated:
+            outcome = str(info.get("status"))
+        self._add_to_video(frames, n_frames, subgoal, outcome)
+        return float(reward), bool(terminated), bool(truncated), info
+
+    def _add_to_video(
+        self, frames: "Frames", count: int, subgoal: str | None, outcome: str | None
+    ) -> None:
+        if self._video is None:
+            return
+        for step, views in enumerate(frames.newest(count), self._steps - count + 1):
+            parts = [f"step {step}", subgoal]
+            if step == self._steps:
+                parts.append(outcome)
+            self._video.add(views, self._goal, " · ".join(part for part in parts if part))
 
     def close(self) -> None:
         """Free the simulator; an unfinished video is removed."""
         if self._video is not None:
             self._video.discard()
         self._env.close()
-
-    def _command(self, action: "np.ndarray | Hold") -> Any:
-        if isinstance(action, Hold):
-            return action
-        self._last = action
-        return benchmark_action(self._robot.action, action, self._stick, self._pose)
 
     def _hold_action(self) -> np.ndarray | None:
         """The policy's action that keeps the robot where it is."""
@@ -321,15 +311,13 @@ class ChunkEnv:
         row[list(self._robot.action.of_pose)] = 0
         return row
 
-    def _note_subgoal(self, info: dict[str, Any]) -> None:
-        """Count the sub-tasks of an environment that only names them."""
+    def _note_info(self, info: Mapping[str, Any]) -> None:
+        """Note the goal, and count the sub-tasks of an environment that only names them."""
+        if goals := info.get("task_goal"):
+            self._goal = str(goals[0])
         text = info.get(SUBGOAL) or self._subgoal
         self._n_subgoals += text != self._subgoal
         self._subgoal = text
-
-    def _note_goal(self, info: Mapping[str, Any]) -> None:
-        if goals := info.get("task_goal"):
-            self._goal = str(goals[0])
 
     def _note_pose(self, observation: dict[str, list[Any]]) -> None:
         if not self._robot.action.of_pose:
@@ -360,13 +348,13 @@ class ChunkEnv:
 
     def _report(self, info: Mapping[str, Any]) -> Report:
         status = info.get("status")
-        self._note_goal(info)
         subtask = self._n_subgoals
         process = None
         progress = getattr(getattr(self._env, "task", None), "progress", None)
         if isinstance(progress, Progress):
             score = process_score(progress, str(status))
-            process = score.to_dict()
+            if status != "ongoing":
+                process = score.to_dict()
             subtask = min(score.done + 1, score.of)
         oracle = None
         if self._oracle and status == "ongoing" and (choice := self._env.oracle()) is not None:
@@ -387,16 +375,6 @@ class ChunkEnv:
         )
         self._simulating = self._rendered = 0.0
         return report
-
-    def _add_to_video(self, frames: "Frames", outcome: StepOutcome, subgoal: str | None) -> None:
-        if self._video is None:
-            return
-        first = self._steps - outcome.frames + 1
-        for step, views in enumerate(frames.newest(outcome.frames), first):
-            parts = [f"step {step}", subgoal]
-            if step == self._steps and outcome.ends_episode:
-                parts.append(str(outcome.info.get("status")))
-            self._video.add(views, self._goal, " · ".join(part for part in parts if part))
 
 
 MISSING = "which this environment does not deliver"
@@ -514,11 +492,7 @@ class EpisodeFactory:
         video = None
         if self.videos is not None:
             folder, save_on = self.videos
-            video = EpisodeVideo(
-                lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal),
-                save_on,
-                self.run,
-            )
+            video = EpisodeVideo(Path(folder), f"{task}_ep{episode}", save_on, self.run)
         stick = task in STICK_TASKS
         if task in TASKS:  # once its module is imported
             stick = stick or bool(getattr(TASKS[task], "stick", False))

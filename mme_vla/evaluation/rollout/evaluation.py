@@ -1,6 +1,7 @@
 """A whole evaluation, from `mme_vla.evaluate` to the records in the run's folder."""
 
 import logging
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,14 +16,13 @@ from mme_vla.envs.metadata import base_of
 from mme_vla.envs.rows import SUFFIX
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, counted
-from mme_vla.evaluation.claims import ALONE, Claims, Shard, Waiting, check_sharing
+from mme_vla.evaluation.claims import ALONE, Claims, Shard, check_sharing
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import (
     EpisodeRecord,
     RecordLog,
     RunKey,
     checkpoint_number,
-    finished,
     merge,
     read_records,
 )
@@ -164,7 +164,7 @@ def evaluate(
         events,
         options,
         name=name,
-        predictor=label,
+        subgoal=label,
         output=output,
     )
 
@@ -211,7 +211,7 @@ def evaluate_policy(
     options: RunOptions,
     *,
     name: str | None = None,
-    predictor: str | None = None,
+    subgoal: str | None = None,
     output: str | Path | None = None,
     training: str = "",
 ) -> Evaluation:
@@ -220,12 +220,12 @@ def evaluate_policy(
     Args:
         events: arms, each a run of its own beside the run without one.
         name: what records call the policy; None for its own name.
-        predictor: name of the subgoal predictor, for the records.
+        subgoal: name of the predictor, for the records.
         output: the run's folder; None for the one that the same command finds again.
         training: of several trainings the one that this is; its records are in a folder of that
             name below the run's.
     """
-    facts = facts_of(policy, name, options.source, settings, predictor)
+    facts = facts_of(policy, name, options.source, settings, subgoal)
     folder = default_output(facts) if output is None else Path(output).expanduser()
     folder = folder / training
     count = counted(len(jobs), "episode")
@@ -335,33 +335,32 @@ class EvaluationRun:
 
     def run(self) -> Evaluation:
         """Run every episode that the folder has no result of yet, the longest first."""
-        options = self.options
+        options, settings = self.options, self.settings
         # Refuse what can be refused, before the folder is claimed.
         check_main_guard()
         self.policy.require_processor().require_stats()
         check_subgoals(self.policy, options.subgoals)
         if options.base is make_env:
-            environment(self.settings.env).check_embodiment(self.policy.embodiment)
-        decisive = run_settings(
-            self.policy, self.facts, self.settings, options.subgoals, options.source
-        )
+            environment(settings.env).check_embodiment(self.policy.embodiment)
+        decisive = run_settings(self.policy, self.facts, settings, options.subgoals, options.source)
         content = begin_run(self.folder, decisive, options.notes)
         workload = Workload()
         with RecordLog(self.folder / options.shard.file) as log:
             check_sharing(self.folder, log.path.name)
             remove_drafts(self.folder / VIDEOS)  # videos of workers that were killed
-            done = self._records()
-            finished_keys = finished(done)
+            # An episode that ended in an error is tried again.
+            before = [record for record in self._records() if record.outcome != "error"]
+            finished_keys = {record.key for record in before}
             missing = [job for job in self.jobs if (job.task, job.episode) not in finished_keys]
             durations = Durations(earlier_records(self.folder, options.times_from))
             missing = durations.longest_first(missing)
-            workers = self.settings.worker_count(-(-len(missing) // options.shard.count))
-            workers = min(workers, self.policy.info.max_running or workers)
+            n_own = -(-len(missing) // options.shard.count)  # if all processes are as fast
+            workers = min(settings.workers or min(len(os.sched_getaffinity(0)), 16), n_own)
+            workers = max(1, min(workers, self.policy.info.max_running or workers))
 
             forecast = None
             if options.show_forecast:
                 forecast = durations.forecast(missing, workers, options.shard.count)
-            before = [record for record in done if record.outcome != "error"]
             name = options.name or self.facts.label
             with RolloutProgress(len(self.jobs), before, options.show_progress, name) as progress:
                 progress.announce(self.folder, forecast)
@@ -398,10 +397,25 @@ class EvaluationRun:
     ) -> Workload:
         """Run these episodes in worker processes. content: of `run.json`, for the receipt."""
         options, settings = self.options, self.settings
+        videos = None
+        if settings.video != "none":
+            videos = (str(self.folder / VIDEOS), settings.video)
+        make = EpisodeFactory(
+            self.policy.embodiment,
+            settings.env,
+            options.base,
+            render=settings.render,
+            only_possible=settings.only_possible,
+            max_steps=settings.limit_of,
+            max_actions=settings.max_actions or self.policy.info.max_actions,
+            videos=videos,
+            run=self.facts.label,
+        )
         claims = Claims(self.folder, log.path.name) if options.shard.count > 1 else None
         renders = options.base is make_env and settings.env == ROBOMME and settings.render
         with (
-            self._environments(workers) as envs,
+            # It begins without jobs: the rollout hands them out.
+            VecEnv([], workers, make, settings.timeout_s) as envs,
             receipt(log.path, self.policy, content, options.source, renders),
         ):
             rollout = Rollout(
@@ -414,27 +428,8 @@ class EvaluationRun:
                 subgoal_folder=self.folder / SUBGOALS if settings.subgoal_log else None,
                 progress=progress,
             )
-            rollout.run(Waiting(missing, claims))
+            rollout.run(missing, claims)
         return rollout.workload
-
-    def _environments(self, workers: int) -> VecEnv:
-        settings = self.settings
-        videos = None
-        if settings.video != "none":
-            videos = (str(self.folder / VIDEOS), settings.video)
-        make = EpisodeFactory(
-            self.policy.embodiment,
-            settings.env,
-            self.options.base,
-            render=settings.render,
-            only_possible=settings.only_possible,
-            max_steps=settings.limit_of,
-            max_actions=settings.max_actions or self.policy.info.max_actions,
-            videos=videos,
-            run=self.facts.label,
-        )
-        # It begins without jobs: `Waiting` hands them out.
-        return VecEnv([], workers, make, settings.timeout_s)
 
 
 def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:

@@ -17,14 +17,13 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError, text_of
-from mme_vla.evaluation.claims import Waiting
+from mme_vla.evaluation.claims import Claims, Waiting
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import ChunkCommand
 from mme_vla.evaluation.rollout.failures import FailureStreaks
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.running import RenderPlan, RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.policy.base import Policy, frames_a_piece
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.subgoal import SubgoalPredictor
@@ -131,23 +130,51 @@ class Rollout:
 
     def on_end(self, running: RunningEpisode, ending: Ending) -> None:
         """Keep what is wanted of an episode that is over: its record."""
-        record = self._record_of(running, ending)
+        job = running.job
+        robot = self.policy.embodiment
+        source = environment(self.settings.env)
+        spec = source.episode(job.task, job.split, job.episode)
+        failed = ending.outcome == "error"
+        record = EpisodeRecord(
+            **self.facts._asdict(),
+            max_steps=self.settings.limit_of(job.task),
+            action_space=robot.action.answers or robot.name,
+            task=job.task,
+            episode=job.episode,
+            seed=spec.seed,
+            difficulty=spec.difficulty,
+            scene=running.report.scene,
+            outcome=ending.outcome,
+            steps=running.steps,
+            seconds=running.seconds,
+            error=ending.reason if failed else None,
+            env=self.settings.env,
+            goal=running.episode.goal,
+            chunks=running.chunks,
+            video_frames=running.video_frames,
+            actions_sha256=running.actions_sha256,
+            suite=source.suite_of(job.task),
+            groups=source.groups_of(job.task) or None,
+            refused=None if failed else ending.reason,
+            video=running.report.video,
+            process=running.report.process,
+            events=tuple(running.events.log),
+            subgoals=None if running.trace is None else running.trace.score.to_dict(),
+        )
         self.record(record)
         self.progress.episode(record, ending.again)
 
     # The rollout ----------------------------------------------------------------------------------
 
-    def run(self, jobs: Sequence[Job] | Waiting) -> None:
-        """Run these episodes."""
-        for _ in self.rounds(jobs):
+    def run(self, jobs: Sequence[Job], claims: Claims | None = None) -> None:
+        """Run these episodes; claims: where other processes run the same ones."""
+        for _ in self.rounds(jobs, claims):
             pass
 
-    def rounds(self, jobs: Sequence[Job] | Waiting) -> Iterator[None]:
+    def rounds(self, jobs: Sequence[Job], claims: Claims | None = None) -> Iterator[None]:
         """Run these episodes; yields after each turn of the policy."""
         begun = time.perf_counter()
-        if not isinstance(jobs, Waiting):
-            jobs = Waiting(jobs)
-        self._waiting = jobs
+        self._waiting = Waiting(jobs, claims)
         for worker in range(self.envs.workers):
             self._start(worker)
         while self.envs.busy or self._scheduler:
@@ -155,7 +182,19 @@ class Rollout:
             seconds = 0 if self._scheduler else None
             for reply in self.envs.recv(seconds):
                 self._take(reply)
-            self._run_scheduler()
+            # Then read, act and prepare for the episodes that wait for the policy.
+            turn_begun = time.perf_counter()
+            for step in self._scheduler.next_steps():
+                if isinstance(step, Act):
+                    self._act(step.batch)
+                elif isinstance(step, Prepare):
+                    if self.policy.prepare(step.work.episode):
+                        self._scheduler.later[step.work] = None
+                else:
+                    step.work.read()
+                    if not step.work.pieces:
+                        self._proceed(step.work)
+            self.workload.policy_s += time.perf_counter() - turn_begun
             yield
         self.workload.wall_s += time.perf_counter() - begun
 
@@ -166,29 +205,32 @@ class Rollout:
             return
         self._tries[job] += 1
         piece = frames_a_piece(self.policy, self.settings.encode_chunk)
-        trace = None
-        if self.subgoals is not None:
-            trace = SubgoalTrace(
-                self.subgoals.kind, self.subgoal_folder, f"{job.task}_ep{job.episode}"
-            )
+        folder = self.subgoal_folder
         running = RunningEpisode(
-            self.policy, job, self.settings.seed, self.subgoals, piece, trace, self._events
+            self.policy, job, self.settings.seed, self.subgoals, piece, folder, self._events, worker
         )
-        running.worker = worker
         self._running[worker] = running
         self.envs.start(worker, job, images=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
-        """Give a worker's reply to its episode: finish it, restart it for images, or queue its
-        frames to be read.
-        """
+        """Give a reply to its episode: end it, restart it for images, or queue its frames."""
         running = self._running[reply.worker]
         self._scheduler.later.pop(running, None)
         self.on_reply(running, reply)
+        if isinstance(reply.error, UserError):
+            raise UserError(f"{reply.job}: {text_of(reply.error)}")
         if reply.error is None:
             running.take_report(reply.info)
+            status = str(running.report.status)
+            message = running.report.error
+        else:
+            status = "error"
+            message = f"{reply.job}: {text_of(reply.error)}"
         if reply.done:
-            self._take_last(running, reply)
+            self._failures.note_end(reply, message, is_repeated=self._tries[running.job] > 1)
+            # A scene in which an object finds no place finds none again.
+            is_unbuildable = isinstance(reply.error, SceneError)
+            self._finish(running, status, message, retry=not is_unbuildable)
             return
         if reply.is_reset:
             self._failures.note_start()
@@ -198,22 +240,6 @@ class Rollout:
         else:
             running.resume(reply.observation)
         self._scheduler.reading.append(running)
-
-    def _take_last(self, running: RunningEpisode, reply: Reply) -> None:
-        """Finish an episode that is over, or that an error ended."""
-        if reply.error is None:
-            running.end()
-            status = str(running.report.status)
-            message = running.report.error
-        else:
-            status = "error"
-            message = f"{reply.job}: {text_of(reply.error)}"
-        if isinstance(reply.error, UserError):
-            raise UserError(str(message))
-        self._failures.note_end(reply, message, is_repeated=self._tries[running.job] > 1)
-        # A scene in which an object finds no place finds none again.
-        is_unbuildable = isinstance(reply.error, SceneError)
-        self._finish(running, status, message, retry=not is_unbuildable)
 
     def _rerenders_video(self, running: RunningEpisode, reply: Reply) -> bool:
         """Reset the episode once more if video frames that its memory reads were not rendered."""
@@ -230,21 +256,6 @@ class Rollout:
         running.first_video_frames = length
         self.envs.start(running.worker, running.job, images=missing)
         return True
-
-    def _run_scheduler(self) -> None:
-        """Observe, prepare and act for the episodes whose environments have replied."""
-        begun = time.perf_counter()
-        for step in self._scheduler.next_steps():
-            if isinstance(step, Act):
-                self._act(step.batch)
-            elif isinstance(step, Prepare):
-                if self.policy.prepare(step.work.episode):
-                    self._scheduler.later[step.work] = None
-            else:
-                step.work.read()
-                if not step.work.pieces:
-                    self._proceed(step.work)
-        self.workload.policy_s += time.perf_counter() - begun
 
     def _proceed(self, running: RunningEpisode) -> None:
         """Queue an episode to act in the next batch, unless an event holds the robot first."""
@@ -264,14 +275,16 @@ class Rollout:
             subgoals = self.subgoals.predict([running.watched for running in batch])
             latency = time.perf_counter() - begun
             for running, subgoal in zip(batch, subgoals, strict=True):
-                running.set_subgoal(subgoal, latency)
+                running.episode.subgoal = subgoal.text
+                if running.trace is not None:
+                    running.trace.add(running.watched, subgoal, latency)
         chunks = self.choose(batch)
         self.workload.batches += 1
         self.workload.chunks += len(batch)
         share = (time.perf_counter() - begun) / len(batch)
         execute = self.settings.execute or self.policy.embodiment.action.execute
         for running, chunk in zip(batch, chunks, strict=True):
-            running.add_policy_seconds(share)
+            running.policy_s += share
             failure = running.episode.failure
             if failure is not None:  # the policy cannot act in it any more
                 if not running.chunks:
@@ -307,36 +320,3 @@ class Rollout:
             self._waiting.put_back(running.job)
         del self._running[running.worker]
         self._start(running.worker)
-
-    def _record_of(self, running: RunningEpisode, ending: Ending) -> EpisodeRecord:
-        job = running.job
-        robot = self.policy.embodiment
-        source = environment(self.settings.env)
-        spec = source.episode(job.task, job.split, job.episode)
-        failed = ending.outcome == "error"
-        return EpisodeRecord(
-            **self.facts._asdict(),
-            max_steps=self.settings.limit_of(job.task),
-            action_space=robot.action.answers or robot.name,
-            task=job.task,
-            episode=job.episode,
-            seed=spec.seed,
-            difficulty=spec.difficulty,
-            scene=running.report.scene,
-            outcome=ending.outcome,
-            steps=running.steps,
-            seconds=running.seconds,
-            error=ending.reason if failed else None,
-            env=self.settings.env,
-            goal=running.episode.goal,
-            chunks=running.chunks,
-            video_frames=running.video_frames,
-            actions_sha256=running.actions_sha256,
-            suite=source.suite_of(job.task),
-            groups=source.groups_of(job.task) or None,
-            refused=None if failed else ending.reason,
-            video=running.report.video,
-            process=running.process,
-            events=tuple(running.events.log),
-            subgoals=None if running.trace is None else running.trace.score.to_dict(),
-        )

@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Container, Sequence
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
-from mme_vla.subgoal import Subgoal, SubgoalPredictor
+from mme_vla.subgoal import SubgoalPredictor
 
 
 def episode_seed(seed: int, task: str, episode: int) -> int:
@@ -44,14 +45,14 @@ def select_frames(frames: Observation, numbers: np.ndarray) -> Observation:
 class RunningEpisode:
     """One episode from before its reset to its end.
 
-    In a round `begin` or `resume` takes the frames, `read` has the policy observe a piece of them,
-    `set_subgoal` and `set_actions` take what was decided, and the environment executes it. `end`
-    counts the last actions.
+    In a round `take_report` notes what was executed, `begin` or `resume` takes the frames, `read`
+    has the policy observe a piece of them, and `set_actions` takes what it decided.
 
     subgoals: predicts the subgoal.
     piece: frames to a piece.
-    trace: logs the subgoals.
+    subgoal_folder: where its subgoals are logged; None keeps their score alone.
     events: what happens to it.
+    worker: of its environment.
     """
 
     def __init__(
@@ -61,32 +62,35 @@ class RunningEpisode:
         seed: int,
         subgoals: SubgoalPredictor | None = None,
         piece: int = 32,
-        trace: SubgoalTrace | None = None,
+        subgoal_folder: Path | None = None,
         events: Sequence[Event] = (),
+        worker: int = -1,
     ) -> None:
         self._policy = policy
         self._subgoals = subgoals
         self._piece = piece
         self.job = job
-        self.trace = trace
+        self.worker = worker
+        self.trace: SubgoalTrace | None = None
+        if subgoals is not None:
+            name = f"{job.task}_ep{job.episode}"
+            self.trace = SubgoalTrace(subgoals.kind, subgoal_folder, name)
         self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
         self.events = EventCourse(events)
         self._visible = np.zeros(0, np.int64)  # The environment's frames that the policy observes
         self._simulated = 0  # Frames of the environment
         self.watched: Any = None  # What the subgoal predictor knows of the episode
-        self.worker = -1
         self.steps = self.chunks = 0
         self.video_frames = 0
         self.report = Report()
         """The environment's last one."""
-        self.process: dict[str, Any] | None = None
-        """Where the chain of sub-tasks broke, once the episode is over and if it is reported."""
         self.first_video_frames: int | None = None
         """Frames of the conditioning video, once it is being simulated again for its images."""
         self._actions = hashlib.sha256()
         self._robot = policy.embodiment
         self._sent = np.zeros((0, self._robot.action.width), np.float32)
-        self._sim = self._render = self._thinking = 0.0
+        self._sim = self._render = 0.0
+        self.policy_s = 0.0  # this episode's share of the policy's time
         self._begun = time.perf_counter()
         self._frames: Observation = {"state": np.zeros((0, self._robot.state.width), np.float32)}
         self._demo = np.zeros(0, bool)
@@ -96,8 +100,11 @@ class RunningEpisode:
     # Observe: frames arrive, and are read piece by piece
 
     def take_report(self, report: Report) -> None:
-        """Note what the environment says."""
+        """Note what the environment says, and count the actions that it executed."""
         self.report = report
+        self.steps += report.frames
+        executed = np.ascontiguousarray(self._sent[: report.executed], np.float32)
+        self._actions.update(executed.tobytes())
         self._sim += report.simulated_s
         self._render += report.rendered_s
         # Which options are possible may change after each choice.
@@ -129,7 +136,6 @@ class RunningEpisode:
 
     def resume(self, frames: Observation) -> None:
         """Take the frames that the executed actions led to."""
-        self._count_executed()
         if self.events.holding is not None:
             self._resume_held(frames, self.events.holding.observed)
             return
@@ -201,7 +207,7 @@ class RunningEpisode:
             self.episode.observe(views, states, demo, actions, rendered=rendered)
         self._show_predictor(views[self._robot.memory_camera], rendered, demo)
         self._at = part.stop
-        self.add_policy_seconds(time.perf_counter() - begun)
+        self.policy_s += time.perf_counter() - begun
 
     def _show_predictor(
         self, images: np.ndarray, rendered: dict[str, np.ndarray], demo: np.ndarray
@@ -233,32 +239,12 @@ class RunningEpisode:
 
     # Decide and act
 
-    def set_subgoal(self, subgoal: Subgoal, latency_s: float) -> None:
-        """Take the subgoal of the current frame."""
-        self.episode.subgoal = subgoal.text
-        if self.trace is not None:
-            self.trace.add(self.watched, subgoal, latency_s)
-
     def set_actions(self, actions: np.ndarray) -> None:
         """Note the actions [n, w] that are sent to the environment."""
         self._sent = actions
         self.chunks += 1
 
-    def add_policy_seconds(self, seconds: float) -> None:
-        """Add this episode's share of the policy's time."""
-        self._thinking += seconds
-
     # Record
-
-    def _count_executed(self) -> None:
-        executed = self._sent[: self.report.executed]
-        self.steps += self.report.frames
-        self._actions.update(np.ascontiguousarray(executed, np.float32).tobytes())
-
-    def end(self) -> None:
-        """Count the last actions; their frames are not needed any more."""
-        self._count_executed()
-        self.process = self.report.process
 
     @property
     def unobserved(self) -> int:
@@ -273,7 +259,7 @@ class RunningEpisode:
         return Seconds(
             sim=round(self._sim, 3),
             render=round(self._render, 3),
-            policy=round(self._thinking, 3),
+            policy=round(self.policy_s, 3),
             total=round(time.perf_counter() - self._begun, 3),
         )
 

@@ -1,6 +1,5 @@
 """The settings of a rollout, checked before anything is loaded."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,11 +92,6 @@ class RolloutSettings:
         if self.max_steps is not None:
             return self.max_steps
         return environment(self.env).task_limit(task, self.split)
-
-    def worker_count(self, episodes: int) -> int:
-        """How many workers run that many episodes."""
-        requested = min(len(os.sched_getaffinity(0)), 16) if self.workers is None else self.workers
-        return max(1, min(requested, episodes))
 
 
 class RolloutKeywords(TypedDict, total=False):

@@ -3,7 +3,7 @@ them the goal, the run, the step, the subgoal and at the end the outcome.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +20,15 @@ class EpisodeVideo:
     The file gets its name, with the outcome, when the episode is over; until then it is a hidden
     file beside it.
 
-    path: of the video, from outcome and goal.
+    folder: of the videos.
+    episode: begins the file's name, `PickXtimes_ep3_success_pick_up_the_red_cube.mp4`.
     save_on: which outcomes are kept: `all`, `success` or `failure`.
     run: name of the run, in every frame.
     """
 
-    def __init__(
-        self, path: Callable[[str, str], Path], save_on: str = "all", run: str = ""
-    ) -> None:
-        self._path = path
+    def __init__(self, folder: Path, episode: str, save_on: str = "all", run: str = "") -> None:
+        self._folder = folder
+        self._episode = episode
         self._save_on = save_on
         self._run = run
         self._video: VideoWriter | None = None
@@ -49,9 +49,8 @@ class EpisodeVideo:
         line = " · ".join(part for part in (self._run, caption) if part)
         text = f"{goal or ''}\n{line}"
         if self._video is None:
-            folder = self._path("", "").parent
-            folder.mkdir(parents=True, exist_ok=True)
-            self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._draft = draft_of(self._folder / f"film-{id(self):x}.mp4")
             self._video = VideoWriter(self._draft)
         self._video.add(video_frame(views, text, demo))
 
@@ -62,7 +61,11 @@ class EpisodeVideo:
             self.discard()
             return None
         self._video.close()
-        target = self._path(outcome, goal)
+        words = re.sub(r"[^a-z0-9]+", "_", goal.lower()).strip("_")
+        if len(words) > _LONGEST_GOAL:
+            words = words[:_LONGEST_GOAL].rpartition("_")[0]
+        name = "_".join(part for part in (self._episode, outcome, words) if part)
+        target = self._folder / f"{name}.mp4"
         self._draft.replace(target)
         self._video = None
         return target
@@ -73,12 +76,3 @@ class EpisodeVideo:
             self._video.close(complete=False)
             self._draft.unlink(missing_ok=True)
             self._video = None
-
-
-def video_name(task: str, episode: int, outcome: str, goal: str) -> str:
-    """`PickXtimes_ep3_success_pick_up_the_red_cube.mp4`."""
-    words = re.sub(r"[^a-z0-9]+", "_", goal.lower()).strip("_")
-    if len(words) > _LONGEST_GOAL:
-        words = words[:_LONGEST_GOAL].rpartition("_")[0]
-    parts = (task, f"ep{episode}", outcome, words)
-    return "_".join(part for part in parts if part) + ".mp4"
