@@ -6,8 +6,9 @@ Trainings of one recipe on the same data are one row and one curve.
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
+import pandas as pd
 
 from mme_vla.errors import counted, require
 from mme_vla.evaluation.pairing import pair
@@ -18,11 +19,11 @@ from mme_vla.evaluation.results.curves import Curves, Place, curves_of
 from mme_vla.evaluation.results.statistics import sign_test
 from mme_vla.evaluation.results.tables import Table
 from mme_vla.memory.perturbation import split_word
-from mme_vla.policy.training_identity import TrainingIdentity, without_seed
+from mme_vla.policy.training_identity import without_seed
 from mme_vla.registry import PERTURBATIONS
 
-Pair = tuple[EpisodeRecord, EpisodeRecord]
-"""An episode's record under an event, and the plain one."""
+_PAIR = ["training", "task", "episode", "without", "with", "idle"]
+"""Columns of a table of pairs: success without and with the event, and whether it did not act."""
 NO_EVENTS = "None of these records is of an event: evaluate with event=pause:100, for instance."
 
 
@@ -72,7 +73,7 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
         runs.setdefault(record.run, {})[record.key] = [record]
 
     # The pairs of every recipe, and notes on episodes that were not paired for their scenes.
-    groups: dict[RunKey, list[Pair]] = {}
+    groups: dict[RunKey, list[list[Any]]] = {}
     notes: list[str] = []
     for run, disturbed in runs.items():
         matched = runs.get(run._replace(event=None), {})
@@ -80,20 +81,23 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
             continue
         pairing = pair([disturbed, matched])
         notes += pairing.notes(str(run))
-        if pairing.keys:
+        for key in pairing.keys:
+            record = disturbed[key][0]
             group = groups.setdefault(run._replace(training=without_seed(run.training)), [])
-            group += [(disturbed[key][0], matched[key][0]) for key in pairing.keys]
+            outcomes = [matched[key][0].success, record.success]
+            group.append(
+                [run.training, key.task, key.episode, *outcomes, bool(did_not_act(record))]
+            )
 
     rows: list[list[str]] = []
     rules: set[int] = set()
-    for run, pairs in groups.items():
-        tasks: dict[str, list[Pair]] = {}
-        for record, baseline in pairs:
-            tasks.setdefault(record.task, []).append((record, baseline))
-        if len(tasks) > 1:
-            tasks["all"] = pairs
-        for task, members in tasks.items():
-            rows.append([str(run._replace(event=None)), str(run.event), task, *_counts(members)])
+    for run, group in groups.items():
+        pairs = pd.DataFrame(group, columns=_PAIR)
+        parts = dict(list(pairs.groupby("task", sort=False)))
+        if len(parts) > 1:
+            parts["all"] = pairs
+        for task, part in parts.items():
+            rows.append([str(run._replace(event=None)), str(run.event), task, *_counts(part)])
         rules.add(len(rows))
     columns = [
         "run", "event", "task", "trainings", "pairs", "without (%)", "with (%)", "kept", "lost",
@@ -104,33 +108,25 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
     )
 
 
-def _counts(pairs: Sequence[Pair]) -> list[str]:
+def _counts(pairs: pd.DataFrame) -> list[str]:
     """The cells of one row from "trainings" on."""
-    changes: Counter[tuple[bool, bool]] = Counter()  # success without, and with the event
-    trainings: dict[TrainingIdentity | None, dict[str, list[tuple[bool, bool]]]] = {}
-    scenes: Counter[EpisodeKey] = Counter()  # trainings that lost it, less those that gained it
-    n_idle = 0
-    for record, baseline in pairs:
-        change = (baseline.success, record.success)
-        changes[change] += 1
-        trainings.setdefault(record.training, {}).setdefault(record.task, []).append(change)
-        scenes[record.key] += baseline.success - record.success
-        n_idle += bool(did_not_act(record))
-
-    cells = [str(len(trainings)), str(len(pairs))]
-    rates = []  # of each training without, and with the event
-    for tasks in trainings.values():
-        rates.append(np.mean([np.mean(part, axis=0) for part in tasks.values()], axis=0))
-    for side in 100 * np.array(rates).T:
-        cell = f"{side.mean():.1f}"
-        if len(side) > 1:
-            cell += f" ± {side.std(ddof=1):.1f}"
+    # Of each training the mean over tasks, without and with the event
+    by_task = pairs.groupby(["training", "task"], sort=False, dropna=False)[["without", "with"]]
+    rates = 100 * by_task.mean().groupby("training", sort=False, dropna=False).mean()
+    cells = [str(len(rates)), str(len(pairs))]
+    for side in rates:
+        cell = f"{rates[side].mean():.1f}"
+        if len(rates) > 1:
+            cell += f" ± {rates[side].std():.1f}"
         cells.append(cell)
-    for change in ((True, True), (True, False), (False, True)):
-        cells.append(str(changes[change]))
-    balances = np.array(list(scenes.values()))
+    kept = pairs["without"] & pairs["with"]
+    lost = pairs["without"] & ~pairs["with"]
+    gained = ~pairs["without"] & pairs["with"]
+    cells += [str(kept.sum()), str(lost.sum()), str(gained.sum())]
+    # How many more trainings lost an episode than gained it
+    balances = (lost.astype(int) - gained).groupby([pairs["task"], pairs["episode"]]).sum()
     p = sign_test(int((balances > 0).sum()), int((balances < 0).sum()))
-    return [*cells, show_p(p), str(n_idle)]
+    return [*cells, show_p(p), str(pairs["idle"].sum())]
 
 
 def event_curves(
