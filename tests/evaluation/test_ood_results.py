@@ -13,6 +13,7 @@ pytest.importorskip("mani_skill", reason="amounts come from scenes, which need t
 from helpers.rollout_fakes import save_records
 from mme_vla.cli.results import main
 from mme_vla.envs import metadata
+from mme_vla.errors import SceneError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results import ood
 from mme_vla.evaluation.results.aggregate import aggregate
@@ -123,6 +124,18 @@ def test_success_is_set_against_the_amount_over_all_splits() -> None:
     assert {row[4] for row in table.rows if int(row[3]) > 5} == {"beyond"}
     assert {row[4] for row in table.rows if int(row[3]) <= 5} <= {"trained"}
     assert "<svg" in next(iter(ood.extrapolation_figures(curves).values()))
+
+
+def test_an_episode_whose_scene_cannot_be_built_is_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def make_task(*_: object, **options: object) -> None:
+        raise SceneError("target_1 finds no place.")
+
+    monkeypatch.setattr(ood, "make_task", make_task)
+    ood.amount_of.cache_clear()
+    assert ood.extrapolation(made("StopCube", "test", [1, 0])) == {}
+    ood.amount_of.cache_clear()
 
 
 def test_a_scene_of_two_splits_counts_once() -> None:

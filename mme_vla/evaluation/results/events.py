@@ -119,10 +119,10 @@ def _counts(pairs: pd.DataFrame) -> list[str]:
         if len(rates) > 1:
             cell += f" ± {rates[side].std():.1f}"
         cells.append(cell)
-    kept = pairs["without"] & pairs["with"]
+    both = pairs["without"] & pairs["with"]
     lost = pairs["without"] & ~pairs["with"]
     gained = ~pairs["without"] & pairs["with"]
-    cells += [str(kept.sum()), str(lost.sum()), str(gained.sum())]
+    cells += [str(both.sum()), str(lost.sum()), str(gained.sum())]
     # How many more trainings lost an episode than gained it
     balances = (lost.astype(int) - gained).groupby([pairs["task"], pairs["episode"]]).sum()
     p = sign_test(int((balances > 0).sum()), int((balances < 0).sum()))

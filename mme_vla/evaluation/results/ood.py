@@ -7,6 +7,7 @@ run a policy, 1,600 steps allowed, from `hongzefu/robomme_benchmark_MotionJEPA`,
 """
 
 from collections.abc import Sequence
+from contextlib import closing
 from functools import cache
 from typing import Any
 
@@ -220,16 +221,14 @@ def amount_of(task: str, split: str, key: EpisodeKey, scene: str | None = None) 
     values: dict[str, Any] = dict(spec.row["spec"]) if spec.row is not None else {}
     if not values:
         require_simulator()
-        env = make_task(task, render=False, **spec.options)
         try:
-            env.reset()
-            values = env.scene_values()["spec"]
-            if scene is not None and scene_digest(env.placed_values()) != scene:
-                return None
+            with closing(make_task(task, render=False, **spec.options)) as env:
+                env.reset()
+                values = env.scene_values()["spec"]
+                if scene is not None and scene_digest(env.placed_values()) != scene:
+                    return None
         except SceneError:
             return None
-        finally:
-            env.close()
     _, name, _ = AMOUNTS[task]
     part, value = name.split(".")
     amount = values[part][value]

@@ -354,8 +354,8 @@ class EvaluationRun:
             missing = [job for job in self.jobs if (job.task, job.episode) not in finished_keys]
             durations = Durations(earlier_records(self.folder, options.times_from))
             missing = durations.longest_first(missing)
-            n_own = -(-len(missing) // options.shard.count)  # if all processes are as fast
-            workers = min(settings.workers or min(len(os.sched_getaffinity(0)), 16), n_own)
+            n_local = -(-len(missing) // options.shard.count)  # if all processes are as fast
+            workers = min(settings.workers or min(len(os.sched_getaffinity(0)), 16), n_local)
             workers = max(1, min(workers, self.policy.info.max_running or workers))
 
             forecast = None

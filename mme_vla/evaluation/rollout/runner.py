@@ -9,13 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from mme_vla.envs.base import environment
-from mme_vla.envs.observations import RenderRequest
-from mme_vla.envs.vector.pool import Job, Reply
+from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import SceneError, UserError, text_of
 from mme_vla.evaluation.claims import Claims, Waiting
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
@@ -27,18 +25,6 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy, frames_a_piece
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.subgoal import SubgoalPredictor
-
-
-class Environments(Protocol):
-    """What a rollout needs of a `VecEnv`."""
-
-    @property
-    def workers(self) -> int: ...
-    @property
-    def busy(self) -> bool: ...
-    def start(self, worker: int, job: Job, images: RenderRequest | None = None) -> None: ...
-    def send(self, worker: int, action: object) -> None: ...
-    def recv(self, timeout: float | None = None) -> list[Reply]: ...
 
 
 @dataclass
@@ -80,7 +66,7 @@ class Rollout:
     def __init__(
         self,
         policy: Policy,
-        envs: Environments,
+        envs: VecEnv,
         facts: RunKey,
         settings: RolloutSettings,
         record: Callable[[EpisodeRecord], None],
@@ -92,7 +78,7 @@ class Rollout:
 
         Args:
             policy: in eval mode, on its device.
-            envs: environments that take chunks (of an `EpisodeFactory`).
+            envs: environments that take chunks (of an `EpisodeFactory`), or what has the interface.
             facts: what the records say of the policy.
             record: called with every record, as soon as there is one.
             subgoals: predicts the subgoal; None leaves it out of the prompt.
@@ -183,7 +169,7 @@ class Rollout:
             for reply in self.envs.recv(seconds):
                 self._take(reply)
             # Then read, act and prepare for the episodes that wait for the policy.
-            turn_begun = time.perf_counter()
+            round_begun = time.perf_counter()
             for step in self._scheduler.next_steps():
                 if isinstance(step, Act):
                     self._act(step.batch)
@@ -194,7 +180,7 @@ class Rollout:
                     step.work.read()
                     if not step.work.pieces:
                         self._proceed(step.work)
-            self.workload.policy_s += time.perf_counter() - turn_begun
+            self.workload.policy_s += time.perf_counter() - round_begun
             yield
         self.workload.wall_s += time.perf_counter() - begun
 
