@@ -40,7 +40,7 @@ from mme_vla.evaluation.results.scopes import (
     suites_of,
     tasks_of,
 )
-from mme_vla.evaluation.results.statistics import Interval, estimate, mean_interval, mean_std
+from mme_vla.evaluation.results.statistics import Interval, estimate, mean_interval
 from mme_vla.policy.training_identity import TrainingIdentity, without_seed
 
 
@@ -368,25 +368,17 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
         if count == 1:
             continue
         same = [method for method in methods if method.label == label]
-        facts: list[dict[str, str | None]] = []
+        rows = []
         for method in same:
             training = method.key.training or TrainingIdentity()
-            facts.append(
-                {
-                    "model": method.key.model,
-                    "composition": method.key.composition,
-                    "recipe": training.recipe,
-                    "data": training.data,
-                }
-            )
-        names = [name for name in kinds if len({fact[name] for fact in facts}) > 1]
-        lacking = False
-        for method, fact in zip(same, facts, strict=True):
-            for name in names:
-                value = fact[name]
-                lacking = lacking or value is None
+            rows.append((method.key.model, method.key.composition, training.recipe, training.data))
+        facts = pd.DataFrame(rows, columns=list(kinds))
+        facts = facts.loc[:, facts.nunique(dropna=False) > 1]
+        names = list(facts)
+        for method, values in zip(same, facts.fillna("unrecorded").to_numpy(), strict=True):
+            for name, value in zip(names, values, strict=True):
                 if name != "model":  # a digest
-                    value = (value or "unrecorded")[:10]
+                    value = value[:10]
                 method.label += f"#{value}"
         if "composition" in names:
             what = kinds["composition"]
@@ -397,7 +389,7 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
             f" {', '.join(method.label for method in same)} (`{'` and `'.join(names)}` in their"
             " records"
         )
-        if lacking:
+        if facts.isna().any(axis=None):
             note += "; records without it are of an earlier version"
         notes.append(f"{note}).")
     return notes
@@ -460,15 +452,17 @@ def _figure(success: pd.DataFrame, method: Method, protocol: Protocol) -> Figure
     several = len(trainings.columns) > 1
     units = trainings if several else complete
     rates = units.groupby(level="task").mean().mean()
-    mean, std = mean_std(list(rates))
+    std = None
+    if len(rates) > 1:
+        std = float(100 * rates.to_numpy().std(ddof=1))
     of_tasks = list(by_task(units).values())
     interval = mean_interval(of_tasks, protocol.confidence)
     if several:
         trained = estimate([of_tasks]).interval(protocol.confidence)
         interval = interval.widen(trained.clip(0, 1))
     return Figure(
-        100 * mean,
-        None if std is None else 100 * std,
+        float(100 * rates.to_numpy().mean()),
+        std,
         interval.percent,
         n_runs,
         n_complete,
@@ -487,10 +481,18 @@ def by_task(success: pd.DataFrame) -> dict[str, np.ndarray]:
 
 def _reported(known: PaperMethod | None, scope: Scope) -> PaperResult | None:
     """The paper's number, where it is about the same tasks."""
-    if known is None or not TASK_FACTS.keys() >= set(scope.tasks) or not scope.covers_benchmark:
+    if known is None or not TASK_FACTS.keys() >= set(scope.tasks):
         return None
     if scope.kind == "task":
         return paper.per_task(known.name)[scope.name]
+    # The benchmark's tasks of this name, which all have to be here
+    tasks = set(scope.tasks)
+    if scope.kind == "average":
+        tasks = set(PAPER_ORDER)
+    elif scope.kind in ("suite", "group"):
+        tasks = {t.name for t in TASK_FACTS.values() if getattr(t, scope.kind) == scope.name}
+    if not tasks <= set(scope.tasks):
+        return None
     if scope.kind == "average":
         return paper.average(known.name)
     return paper.mean_over(known.name, scope.tasks)

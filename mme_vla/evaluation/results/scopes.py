@@ -228,16 +228,6 @@ class Scope(NamedTuple):
     name: str
     tasks: tuple[str, ...]
 
-    @property
-    def covers_benchmark(self) -> bool:
-        """Whether all the benchmark's tasks of this name are in it."""
-        if self.kind == "average":
-            return set(self.tasks) >= set(PAPER_ORDER)
-        if self.kind in ("suite", "group"):
-            of_name = [task.name for task in _TASKS if getattr(task, self.kind) == self.name]
-            return set(self.tasks) >= set(of_name)
-        return True
-
 
 def scopes(protocol: Protocol) -> list[Scope]:
     """Everything figures are made of, whole tasks at a time (difficulties cut across them)."""

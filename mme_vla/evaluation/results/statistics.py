@@ -43,16 +43,6 @@ class Interval(NamedTuple):
         return Interval(max(self.low, low), min(self.high, high))
 
 
-def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
-    """Mean and sample standard deviation (divisor n − 1), as the released aggregation; one value
-    has none.
-    """
-    array = np.asarray(values, np.float64)
-    if len(array) == 1:
-        return float(array.mean()), None
-    return float(array.mean()), float(array.std(ddof=1))
-
-
 # Rates --------------------------------------------------------------------------------------------
 
 

@@ -112,36 +112,6 @@ class Report:
     rendered_s: float = 0.0
 
 
-class RenderClock:
-    """Adds up what the simulator spends on taking images, where its scene is within reach."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def watch(self, env: Any) -> None:
-        """Time the images of this environment."""
-        if isinstance(env, EpisodeEnv):
-            env.render_image = self._timed(env.render_image)  # type: ignore[method-assign]
-            return
-        scene = getattr(getattr(env, "task", None), "scene", None)
-        if scene is None:  # in the official package images are part of the simulation
-            return
-        scene.update_render = self._timed(scene.update_render)
-        for sensor in scene.sensors.values():
-            sensor.capture = self._timed(sensor.capture)
-            sensor.get_obs = self._timed(sensor.get_obs)
-
-    def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            begun = time.perf_counter()
-            try:
-                return call(*args, **kwargs)
-            finally:
-                self.seconds += time.perf_counter() - begun
-
-        return timed
-
-
 class ChunkEnv:
     """One episode that takes chunks of actions.
 
@@ -174,8 +144,7 @@ class ChunkEnv:
         self._max_actions = max_actions
         self._max_steps = max_steps
         self._video = video
-        self._clock = RenderClock()
-        self._simulating = self._rendered = 0.0  # seconds since the last report
+        self._simulating = self._rendered = 0.0  # seconds since the last report; images in both
         self._executed = 0  # actions
         self._steps = 0
         self._returned = 0  # frames
@@ -187,7 +156,16 @@ class ChunkEnv:
         self._scene = NOT_BUILT
         with self._simulation():
             self._env = make()
-        self._clock.watch(self._env)
+        # Time the images, where the simulator's scene is within reach: in the official package they
+        # are part of the simulation.
+        scene = getattr(getattr(self._env, "task", None), "scene", None)
+        if isinstance(self._env, EpisodeEnv):
+            self._env.render_image = self._timed(self._env.render_image)  # type: ignore[method-assign]
+        elif scene is not None:
+            scene.update_render = self._timed(scene.update_render)
+            for sensor in scene.sensors.values():
+                sensor.capture = self._timed(sensor.capture)
+                sensor.get_obs = self._timed(sensor.get_obs)
 
     def reset(self, images: RenderRequest | None = None) -> tuple[Observation, Report]:
         """All frames of the conditioning video, the current one last, and the report.
@@ -338,13 +316,22 @@ class ChunkEnv:
     @contextmanager
     def _simulation(self) -> Iterator[None]:
         begun = time.perf_counter()
-        rendered = self._clock.seconds
         try:
             yield
         finally:
-            render_seconds = self._clock.seconds - rendered
-            self._rendered += render_seconds
-            self._simulating += time.perf_counter() - begun - render_seconds
+            self._simulating += time.perf_counter() - begun
+
+    def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        """A call that renders, within the simulation."""
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            begun = time.perf_counter()
+            try:
+                return call(*args, **kwargs)
+            finally:
+                self._rendered += time.perf_counter() - begun
+
+        return timed
 
     def _report(self, info: Mapping[str, Any]) -> Report:
         status = info.get("status")
@@ -370,7 +357,7 @@ class ChunkEnv:
             began=getattr(self._env, "began", None) or (),
             process=process,
             oracle=oracle,
-            simulated_s=self._simulating,
+            simulated_s=self._simulating - self._rendered,
             rendered_s=self._rendered,
         )
         self._simulating = self._rendered = 0.0

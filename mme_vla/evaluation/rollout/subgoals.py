@@ -170,12 +170,13 @@ class SubgoalTrace:
         self.score = SubgoalScore()
         self._kind = kind
         self._name = name
-        self._folder = folder
+        self._file: Path | None = None
         self._meant: str | None = None
         self._begun = time.perf_counter()
         if folder is not None:
             shutil.rmtree(folder / name, ignore_errors=True)
             (folder / name).mkdir(parents=True, exist_ok=True)
+            self._file = folder / f"{name}.jsonl"
             self._file.write_bytes(b"")
 
     def add(self, episode: SubgoalEpisode, subgoal: Subgoal, latency_s: float) -> None:
@@ -187,12 +188,12 @@ class SubgoalTrace:
         # Between two sub-tasks the environment names none, and the last one stays, as in training.
         self._meant = online_subgoal(episode.info, self._kind) or self._meant
         self.score.add(subgoal.text, self._meant, subgoal.queried, subgoal.problem)
-        if self._folder is None:
+        if self._file is None:
             return
         from PIL import Image
 
         image_name = f"{self._name}/{episode.step:05d}.jpg"
-        Image.fromarray(episode.frame).save(self._folder / image_name, quality=90)
+        Image.fromarray(episode.frame).save(self._file.parent / image_name, quality=90)
         line = {
             "step": episode.step,
             "seconds": round(time.perf_counter() - self._begun, 3),
@@ -209,8 +210,3 @@ class SubgoalTrace:
         }
         with self._file.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")
-
-    @property
-    def _file(self) -> Path:
-        assert self._folder is not None
-        return self._folder / f"{self._name}.jsonl"
