@@ -451,7 +451,7 @@ class EpisodeFactory:
         `max_steps`; importable by name.
     options: further arguments of what makes it.
     max_steps, max_actions, oracle: see `ChunkEnv`; or a function that gives the steps for a task.
-    videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
+    videos: folder, and which outcomes are kept: `none`, `all`, `success` or `failure`.
     run: its name, in the videos.
 
     Raises:
@@ -468,7 +468,7 @@ class EpisodeFactory:
     max_steps: int | Callable[[str], int] = DEFAULT_STEPS
     max_actions: int | None = None
     oracle: bool = False
-    videos: tuple[str, str] | None = None
+    videos: tuple[str, str] = ("", "none")
     run: str = ""
 
     def __post_init__(self) -> None:
@@ -477,8 +477,8 @@ class EpisodeFactory:
 
     def __call__(self, task: str, split: str, episode: int) -> ChunkEnv:
         video = None
-        if self.videos is not None:
-            folder, save_on = self.videos
+        folder, save_on = self.videos
+        if save_on != "none":
             video = EpisodeVideo(Path(folder), f"{task}_ep{episode}", save_on, self.run)
         stick = task in STICK_TASKS
         if task in TASKS:  # once its module is imported

@@ -397,9 +397,6 @@ class EvaluationRun:
     ) -> Workload:
         """Run these episodes in worker processes. content: of `run.json`, for the receipt."""
         options, settings = self.options, self.settings
-        videos = None
-        if settings.video != "none":
-            videos = (str(self.folder / VIDEOS), settings.video)
         make = EpisodeFactory(
             self.policy.embodiment,
             settings.env,
@@ -408,7 +405,7 @@ class EvaluationRun:
             only_possible=settings.only_possible,
             max_steps=settings.limit_of,
             max_actions=settings.max_actions or self.policy.info.max_actions,
-            videos=videos,
+            videos=(str(self.folder / VIDEOS), settings.video),
             run=self.facts.label,
         )
         claims = Claims(self.folder, log.path.name) if options.shard.count > 1 else None

@@ -42,20 +42,6 @@ class Workload:
         return self.chunks / max(self.batches, 1)
 
 
-@dataclass(frozen=True)
-class Ending:
-    """How an episode ended (docs/evaluate/evaluation.md lists causes).
-
-    outcome: `success`, `fail`, `timeout` or `error`.
-    reason: the error, or of another outcome why the last action was refused; None without one.
-    again: whether the episode is tried once more.
-    """
-
-    outcome: str
-    reason: str | None
-    again: bool
-
-
 class Rollout:
     """Runs episodes and records each when it ends.
 
@@ -114,13 +100,19 @@ class Rollout:
         """The chunks [n, h, w] that these episodes execute the first actions of."""
         return self.policy.act([running.episode for running in batch], self.settings.flow_steps)
 
-    def on_end(self, running: RunningEpisode, ending: Ending) -> None:
-        """Keep what is wanted of an episode that is over: its record."""
+    def on_end(
+        self, running: RunningEpisode, outcome: str, reason: str | None, again: bool
+    ) -> None:
+        """Keep what is wanted of an episode that is over: its record.
+
+        reason: the error, or of another outcome why the last action was refused.
+        again: whether the episode is tried once more.
+        """
         job = running.job
         robot = self.policy.embodiment
         source = environment(self.settings.env)
         spec = source.episode(job.task, job.split, job.episode)
-        failed = ending.outcome == "error"
+        failed = outcome == "error"
         record = EpisodeRecord(
             **self.facts._asdict(),
             max_steps=self.settings.limit_of(job.task),
@@ -130,10 +122,10 @@ class Rollout:
             seed=spec.seed,
             difficulty=spec.difficulty,
             scene=running.report.scene,
-            outcome=ending.outcome,
+            outcome=outcome,
             steps=running.steps,
             seconds=running.seconds,
-            error=ending.reason if failed else None,
+            error=reason if failed else None,
             env=self.settings.env,
             goal=running.episode.goal,
             chunks=running.chunks,
@@ -141,14 +133,14 @@ class Rollout:
             actions_sha256=running.actions_sha256,
             suite=source.suite_of(job.task),
             groups=source.groups_of(job.task) or None,
-            refused=None if failed else ending.reason,
+            refused=None if failed else reason,
             video=running.report.video,
             process=running.report.process,
             events=tuple(running.events.log),
             subgoals=None if running.trace is None else running.trace.score.to_dict(),
         )
         self.record(record)
-        self.progress.episode(record, ending.again)
+        self.progress.episode(record, again)
 
     # The rollout ----------------------------------------------------------------------------------
 
@@ -301,7 +293,7 @@ class Rollout:
         running.episode.close()
         again = outcome == "error" and retry and self._tries[running.job] <= self.settings.retries
         # The record of an error is superseded by that of the repetition (`records.merge`).
-        self.on_end(running, Ending(outcome, error, again))
+        self.on_end(running, outcome, error, again)
         if again:
             self._waiting.put_back(running.job)
         del self._running[running.worker]

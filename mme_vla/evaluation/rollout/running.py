@@ -93,7 +93,7 @@ class RunningEpisode:
         self.policy_s = 0.0  # this episode's share of the policy's time
         self._begun = time.perf_counter()
         self._frames: Observation = {"state": np.zeros((0, self._robot.state.width), np.float32)}
-        self._demo = np.zeros(0, bool)
+        self._demo: np.ndarray = np.zeros(0, bool)
         self._leading: np.ndarray | None = None  # Actions that led to the waiting frames
         self._at = 0
 
@@ -124,15 +124,13 @@ class RunningEpisode:
         # Events may leave out or repeat frames of the video; the current one is always observed.
         last = len(frames["state"]) - 1
         observed = np.append(self.events.video(last), last)
-        self._note_observed(last + 1, observed)
-        frames = select_frames(frames, observed)
-        self.video_frames = len(frames["state"]) - 1
+        self.video_frames = len(observed) - 1
+        self._queue(frames, observed, None, n_video=self.video_frames)
         if self._subgoals is not None:
             video = None
             if self.video_frames and self._subgoals.sees_video:
-                video = np.stack(frames[self._robot.memory_camera][:-1])
+                video = np.stack(self._frames[self._robot.memory_camera][:-1])
             self.watched = self._subgoals.start_episode(goal, video, self.job.task)
-        self._queue(frames, np.arange(self.video_frames + 1) < self.video_frames, None)
 
     def resume(self, frames: Observation) -> None:
         """Take the frames that the executed actions led to."""
@@ -140,10 +138,13 @@ class RunningEpisode:
             self._resume_held(frames, self.events.holding.observed)
             return
         n_frames = len(frames["state"])
-        self._note_observed(n_frames, np.arange(n_frames))
-        if self._robot.action.frames is not None:
-            n_frames = self.report.executed
-        self._queue(frames, np.zeros(n_frames, bool), self._sent[: self.report.executed])
+        executed = self._sent[: self.report.executed]
+        if self._robot.action.frames is not None and n_frames != len(executed):
+            raise UserError(
+                f"{self.job}: {n_frames} frames for {len(executed)} actions; rollouts need one"
+                " frame an action."
+            )
+        self._queue(frames, np.arange(n_frames), executed)
 
     def _resume_held(self, frames: Observation, n_observed: int) -> None:
         """Take the newest frames of the time for which an event held the robot."""
@@ -151,29 +152,28 @@ class RunningEpisode:
         self.events.hold_steps += length
         n_frames = min(n_observed, length)
         observed = np.arange(length - n_frames, length)
-        self._note_observed(length, observed)
         leading: np.ndarray | None = self._sent[:0]
         if self._robot.action.frames is not None:
             leading = None  # before the first action
             if self.report.held is not None:
                 target = np.asarray(self.report.held, np.float32)
                 leading = np.repeat(target[None], n_frames, axis=0)
-        self._queue(select_frames(frames, observed), np.zeros(n_frames, bool), leading)
+        self._queue(frames, observed, leading)
 
-    def _note_observed(self, length: int, observed: np.ndarray) -> None:
-        """Note which of the next `length` frames the policy observes, int64 [n]."""
+    def _queue(
+        self,
+        frames: Observation,
+        observed: np.ndarray,
+        leading: np.ndarray | None,
+        n_video: int = 0,
+    ) -> None:
+        """Have those of the environment's next frames that the policy observes, int64 [n], wait to
+        be read, with the actions that led to them.
+        """
         self._visible = np.concatenate([self._visible, self._simulated + observed])
-        self._simulated += length
-
-    def _queue(self, frames: Observation, demo: np.ndarray, leading: np.ndarray | None) -> None:
-        """Have frames wait to be read, with the actions that led to them."""
-        if len(frames["state"]) != len(demo):
-            raise UserError(
-                f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
-                " one frame an action."
-            )
-        self._frames = frames
-        self._demo = demo
+        self._simulated += len(frames["state"])
+        self._frames = select_frames(frames, observed)
+        self._demo = np.arange(len(observed)) < n_video
         self._leading = leading
         self._at = 0
         began = np.searchsorted(self._visible, self.report.began)  # as numbers of observed frames

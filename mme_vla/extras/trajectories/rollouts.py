@@ -19,7 +19,7 @@ from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
 from mme_vla.evaluation.records import RunKey
 from mme_vla.evaluation.rollout.environment import EpisodeFactory, Report
-from mme_vla.evaluation.rollout.runner import Ending, Rollout
+from mme_vla.evaluation.rollout.runner import Rollout
 from mme_vla.evaluation.rollout.running import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.trajectories.choice import ChoiceHead
@@ -361,15 +361,21 @@ class _Collector(Rollout):
             self._decisions[running].append(decision)
         return actions
 
-    def on_end(self, running: RunningEpisode, ending: Ending) -> None:
+    def on_end(
+        self, running: RunningEpisode, outcome: str, reason: str | None, again: bool
+    ) -> None:
         """Make a trajectory of the episode, unless it is tried again."""
         decisions = self._decisions.pop(running, [])
         self._oracle.pop(running, None)
-        if not ending.again:
-            self.finished.append(self._trajectory(running, ending, decisions))
+        if not again:
+            self.finished.append(self._trajectory(running, outcome, reason, decisions))
 
     def _trajectory(
-        self, running: RunningEpisode, ending: Ending, decisions: Sequence[_Decision]
+        self,
+        running: RunningEpisode,
+        outcome: str,
+        reason: str | None,
+        decisions: Sequence[_Decision],
     ) -> Trajectory:
         chunks: list[Tensor] = []
         actions: list[np.ndarray] = []
@@ -397,7 +403,7 @@ class _Collector(Rollout):
             stacked_chunks = torch.stack(chunks)
         return Trajectory(
             running.job,
-            ending.outcome,
+            outcome,
             running.steps,
             stacked_chunks,
             tuple(actions),
@@ -406,7 +412,7 @@ class _Collector(Rollout):
             log_probs=torch.stack(log_probs) if log_probs else None,
             paths=torch.stack(paths) if paths else None,
             oracle=join(targets) if "oracle" in self.keep and targets else None,
-            error=ending.reason if ending.outcome == "error" else None,
+            error=reason if outcome == "error" else None,
         )
 
     def _labelled(self, row: Batch, state: Tensor, actions: np.ndarray) -> Batch:
