@@ -148,32 +148,24 @@ def twin_table(
     and ended otherwise. Episodes whose scenes are not the same are left out, and counted in the
     table's notes.
     """
-    merged = merge(records, conflicts)
     repeats = repeated_episodes(records)
-    table = record_table(merged)
-    table["key"] = [record.key for record in merged]
-    runs = dict(list(table.groupby("run", sort=False)))
+    runs: dict[RunKey, dict[EpisodeKey, list[EpisodeRecord]]] = {}
+    for record in merge(records, conflicts):
+        runs.setdefault(record.run, {})[record.key] = [record]
     rows = []
     notes: list[str] = []
-    for run, members in runs.items():
+    for run, episodes in runs.items():
         twin = run._replace(split=f"{TWIN}:{run.split}")
         if run.split == BASE:
             twin = run._replace(split=TWIN)
         if twin not in runs:
             continue
-        base = members.set_index("key", drop=False)
-        visible = runs[twin].set_index("key", drop=False)
-        pairing = pair(
-            [
-                {key: [record] for key, record in base["record"].items()},
-                {key: [record] for key, record in visible["record"].items()},
-            ]
-        )
+        pairing = pair([episodes, runs[twin]])
         notes += pairing.notes(f"{run} and its twin")
         if not pairing.keys:
             continue
-        base = base[base["key"].isin(pairing.keys)]
-        visible = visible[visible["key"].isin(pairing.keys)]
+        base = record_table([episodes[key][0] for key in pairing.keys])
+        visible = record_table([runs[twin][key][0] for key in pairing.keys])
         gaps = visible["success"] - base["success"]
         base_share = count_successes(base, confidence)
         visible_share = count_successes(visible, confidence)
