@@ -33,7 +33,7 @@ from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
     RunOptions,
     check_subgoals,
-    choose_episodes,
+    choose_jobs,
     evaluate_policy,
     kind_section,
 )
@@ -108,7 +108,7 @@ def evaluate_one(run: EvaluateCommand, training: str = "") -> None:
         torch.use_deterministic_algorithms(True, warn_only=True)
         torch.backends.cudnn.benchmark = False
     tasks = named_tasks(run.policy.config)
-    jobs = choose_episodes(tasks, run.episodes, settings.split, settings.env)
+    jobs = choose_jobs(tasks, run.episodes, settings.split, settings.env)
     shard = choose_shard(run.shard)
     environment(settings.env).check_installed()
     log_to_terminal(logger)

@@ -22,7 +22,7 @@ from mme_vla.config.plugins import TRUST_FLAG, TRUST_WORD, plugins_of
 from mme_vla.config.plugins import import_plugins as import_modules
 from mme_vla.envs import metadata
 from mme_vla.evaluation.records import RunKey
-from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, choose_episodes
+from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, choose_jobs
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.cli import analyse
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
@@ -187,7 +187,7 @@ def test_a_memory_and_a_task_of_the_user_are_evaluated_in_a_worker_process(
     import_modules([f"{USER_PACKAGE}.task"])
     settings = RolloutSettings(max_steps=3, execute=2, flow_steps=1, workers=1, render=False)
     facts = RunKey("fading", 1, 42)
-    jobs, options = choose_episodes("Stay", 1), RunOptions(show_progress=False)
+    jobs, options = choose_jobs("Stay", 1), RunOptions(show_progress=False)
     records = EvaluationRun(policy, jobs, tmp_path, facts, settings, options).run().records
     assert [(r.task, r.outcome, r.steps) for r in records] == [("Stay", "timeout", 4)]
 
@@ -202,7 +202,7 @@ def test_episodes_of_a_custom_task_have_separate_seeds(foreign_run: Path) -> Non
     }
     assert len(seeds) == 100
     assert not seeds & benchmark
-    assert [job.episode for job in choose_episodes("Stay", [3], "val")] == [3]
+    assert [job.episode for job in choose_jobs("Stay", [3], "val")] == [3]
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def test_episodes_are_named_by_their_count_number_or_range(
 def test_the_same_words_choose_the_same_episodes_in_every_command(command: str) -> None:
     more = ["output=x", "split=test"] if command == "record" else []
     cfg = compose(command, ["tasks=[StopCube,BinFill]", "episodes=[0-2,7]", *more])
-    choose = rollout_plan.choose_episodes if command == "evaluate" else choose_episodes
+    choose = rollout_plan.choose_jobs if command == "evaluate" else choose_episodes
     specs = (
         record.plan(record.RecordRun.from_config(resolved(cfg)))
         if command == "record"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Unpack
 
 from mme_vla.config.sections import read_section, without
 from mme_vla.envs.base import environment
-from mme_vla.envs.episodes import choose_episodes as choose_specs
+from mme_vla.envs.episodes import choose_episodes
 from mme_vla.envs.make import ROBOMME, make_env
 from mme_vla.envs.metadata import base_of
 from mme_vla.envs.rows import SUFFIX
@@ -150,7 +150,7 @@ def evaluate(
         check_output(output)
         check_run_folder(Path(output).expanduser())
     events = event_arms(event)
-    jobs = choose_episodes(tasks, episodes, rollout_settings.split, rollout_settings.env)
+    jobs = choose_jobs(tasks, episodes, rollout_settings.split, rollout_settings.env)
     if base is make_env:
         environment(rollout_settings.env).check_installed()
     loaded, source = load(policy)
@@ -169,7 +169,7 @@ def evaluate(
     )
 
 
-def choose_episodes(
+def choose_jobs(
     tasks: str | Sequence[str] = "all",
     episodes: Any = None,
     split: str = "test",
@@ -178,7 +178,7 @@ def choose_episodes(
     """The episodes of a run, task by task."""
     return [
         Job(spec.task, spec.split, spec.episode)
-        for spec in choose_specs(tasks, episodes, split, env)
+        for spec in choose_episodes(tasks, episodes, split, env)
     ]
 
 

@@ -15,7 +15,7 @@ from mme_vla.data.recording import action_offset_of
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
-from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, facts_of
+from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_jobs, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.audit.audit import N_RUNS, AuditSettings, run_audit, scenes_a_task
 from mme_vla.extras.probing.card import card_text
@@ -36,9 +36,9 @@ def main(cfg: DictConfig) -> None:
     tasks = named_tasks(values)
     episodes = values["episodes"]
     if episodes is None:
-        n_tasks = len({job.task for job in choose_episodes(tasks, 1, settings.split, settings.env)})
+        n_tasks = len({job.task for job in choose_jobs(tasks, 1, settings.split, settings.env)})
         episodes = scenes_a_task(audit, n_tasks)
-    jobs = choose_episodes(tasks, episodes, settings.split, settings.env)
+    jobs = choose_jobs(tasks, episodes, settings.split, settings.env)
     source.check_installed()
     log_to_terminal(logger)
     device = process_device(choice.device)

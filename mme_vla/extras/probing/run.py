@@ -25,7 +25,7 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import (
     EvaluationRun,
     RunOptions,
-    choose_episodes,
+    choose_jobs,
     facts_of,
     load,
     predictor_of,
@@ -286,7 +286,7 @@ def probe(
         recorded = all_recordings(sources, action_offset_of(loaded))
     jobs: list[Job] = []
     if tasks is not None:
-        jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
+        jobs = choose_jobs(tasks, episodes, run_settings.split, run_settings.env)
     if jobs and base is make_env:
         environment(run_settings.env).check_installed()
     predictor = predictor_of(loaded, subgoal)

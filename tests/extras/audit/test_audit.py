@@ -24,7 +24,7 @@ from mme_vla.data.sources import open_sources
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.base import environment
 from mme_vla.evaluation.rollout import evaluation
-from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, facts_of
+from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_jobs, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_records
 from mme_vla.extras.audit import audit as audit_module
@@ -102,7 +102,7 @@ def recordings(
 def audit(
     policy: Policy, task: str, folder: Path, lend: list[Recording], scenes: int = 14, **more: Any
 ) -> Audit:
-    jobs = choose_episodes(task, scenes, "test", ENVS[task])
+    jobs = choose_jobs(task, scenes, "test", ENVS[task])
     facts = facts_of(policy, None, None, settings(task), None)
     budget = AuditSettings(**more)
     return run_audit(policy, jobs, folder, facts, settings(task), SILENT, budget, lend)
@@ -307,7 +307,7 @@ def test_the_cards_from_outside_and_from_inside_agree(
     policy = {"Cues": in_cues, "Blink": in_blink}[task]
     policy.is_clock = is_clock
     lend = recordings[task]
-    jobs = choose_episodes(task, 14, "test", ENVS[task])
+    jobs = choose_jobs(task, 14, "test", ENVS[task])
     facts = facts_of(policy, None, None, settings(task), None)
     plan = ProbePlan(lend=lend, jobs=jobs)
     inside = run_card(policy, plan, tmp_path / "inside", facts, settings(task), SILENT)
@@ -341,7 +341,7 @@ def test_the_cards_of_the_shipped_policy_agree(
     limits = RolloutSettings(
         seed=7, split="further_easy", max_actions=20, only_possible=True, workers=1
     )
-    jobs = choose_episodes("VideoUnmask", list(range(2, 8)), limits.split)
+    jobs = choose_jobs("VideoUnmask", list(range(2, 8)), limits.split)
     plan = ProbePlan(lend=lend, jobs=jobs)
     facts = facts_of(policy, None, place, limits, None)
     inside = run_card(policy, plan, tmp_path / "inside", facts, limits, SILENT)
@@ -394,7 +394,7 @@ def test_scenes_of_an_interrupted_pilot_do_not_make_a_scene_look_quick(
     monkeypatch.setattr(audit_module, "ended_scenes", lambda *_: ended)
     monkeypatch.setattr(audit_module, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     (tmp_path / "online" / "unprobed").mkdir(parents=True)
-    jobs = choose_episodes("PickXtimes", 6, "test")
+    jobs = choose_jobs("PickXtimes", 6, "test")
     limit = seconds * audit_module.N_RUNS * 4 / 60  # of four scenes and a little
     audit_module._affordable_scenes(jobs, tmp_path, 1.01 * limit, lambda _: None)
     plan = json.loads((tmp_path / "plan.json").read_text())

@@ -34,7 +34,7 @@ def probe(cfg: DictConfig) -> None:
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_numbers, named_tasks
     from mme_vla.evaluation.claims import choose_shard
-    from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, facts_of
+    from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_jobs, facts_of
     from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.extras.probing.card import PAGE, card_text, run_card
@@ -61,9 +61,7 @@ def probe(cfg: DictConfig) -> None:
     offline = read_section(OfflineSettings, values, others=True)
     jobs = []
     if choice.in_closed_loop or choice.twins:
-        jobs = choose_episodes(
-            named_tasks(values), values["episodes"], settings.split, settings.env
-        )
+        jobs = choose_jobs(named_tasks(values), values["episodes"], settings.split, settings.env)
     shard = choose_shard(values["shard"])
     if jobs:
         environment(settings.env).check_installed()
