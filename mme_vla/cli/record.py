@@ -71,15 +71,12 @@ _FPS = 20  # of RoboMME's cameras and control
 FAILED = "the demonstration did not end in success"
 
 
-def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
+def record_episode(job: Job, folder: Path, previews: Path | None = None) -> None:
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
 
     Where not all frames are rendered, it is made twice: first without images, to choose the frames,
-    and again with images of them.
-
-    Returns:
-        Task, episode, the seed that succeeded, steps, stored steps, video steps, the failed seeds
-        with reasons, and the facts.
+    and again with images of them. What is known of it goes into `<folder>/<name>.json`: the seed
+    that succeeded, steps, stored steps, video steps, the failed seeds with reasons, and the facts.
     """
     from mme_vla.envs.robomme.recording.recorder import Recorder
     from mme_vla.envs.robomme.scene.placement import SceneError
@@ -122,18 +119,19 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
             draft.rename(folder / f"{job.name}.h5")
             if previews is not None:
                 write_previews(folder / f"{job.name}.h5", job.episode, job.task, previews)
-            counts = {"steps": result.steps, "stored": result.stored, "video": result.video}
             done = {
                 "task": job.task,
                 "episode": job.episode,
                 "seed": seed,
-                **counts,
+                "steps": result.steps,
+                "stored": result.stored,
+                "video": result.video,
                 "failed_seeds": failures,
                 "facts": [fact.to_dict() for fact in result.facts],
             }
             # last: what it tells of is there
             write_json(folder / f"{job.name}.json", done, indent=None)
-            return done
+            return
         failures[seed] = result.error or FAILED
     draft.unlink(missing_ok=True)
     last = list(failures.items())[-1]
