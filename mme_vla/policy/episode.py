@@ -76,7 +76,7 @@ class Episode:
         """State of a streaming memory between two `act`s."""
         self.read: History | None = None
         """The history as the last `act` read it, conditioned on the prompt."""
-        self.read_prompt: Tensor | None = None
+        self._read_prompt: Tensor | None = None
         """Token ids of that prompt, where a backbone conditions on it."""
         self._past: PastImages | None = None
         self._motion_of_frames: list[Tensor] = []
@@ -99,6 +99,16 @@ class Episode:
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""
         self._executed = self._no_actions
+
+    def renew_stream(self, prompt: Tensor) -> None:
+        """Begin the stream anew where the prompt, token ids [l], is another than before: its state
+        was made of tokens that the former one conditioned.
+        """
+        memory = self.policy.memory
+        is_known = self._read_prompt is None or prompt.equal(self._read_prompt)
+        if memory is not None and not is_known:
+            self.stream = memory.start_stream()
+        self._read_prompt = prompt
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         # What holds policy and episode is copied with both: the policy comes first there.

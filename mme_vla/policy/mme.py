@@ -423,18 +423,11 @@ class MMEPolicy(NetworkPolicy, Recomputes):
             batch = self.observation(episodes)
         with self.autocast():
             histories = []
-            is_conditioned = (
-                type(self.backbone).condition_on_prompt is not Backbone.condition_on_prompt
-            )
             for i, episode in enumerate(episodes):
                 with_prompt = self.model.prompt_condition(batch.rows(slice(i, i + 1)))
                 history = PromptConditionedHistory(episode.required_history(), with_prompt)
-                if is_conditioned:
-                    prompt = batch.prompt[i, batch.prompt_mask[i]]
-                    if episode.read_prompt is not None and not prompt.equal(episode.read_prompt):
-                        # Its state was made of tokens as the prompt before conditioned them.
-                        episode.stream = self.memory.start_stream()
-                    episode.read_prompt = prompt
+                if type(self.backbone).condition_on_prompt is not Backbone.condition_on_prompt:
+                    episode.renew_stream(batch.prompt[i, batch.prompt_mask[i]])
                 episode.read = history
                 histories.append(history)
             return self.memory.encode(histories, [episode.stream for episode in episodes])
