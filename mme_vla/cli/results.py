@@ -15,10 +15,11 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.envs.episodes import ALL, GRAMMAR, check_episodes, choose_numbers, read_episodes
+from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, counted, printable, require
 from mme_vla.evaluation.records import EpisodeRecord, merge
-from mme_vla.evaluation.results.aggregate import Method, Results, aggregate, limit_notes, select
+from mme_vla.evaluation.results.aggregate import Method, Results, aggregate, select, setting_notes
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.compare import (
     Comparison,
@@ -260,9 +261,9 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     there are records.
     """
     of_split = [record for record in records if split in (None, record.split)]
-    custom = [record.episode for record in of_split if record.suite]
-    if custom and not any(record.task in TASK_FACTS for record in records):
-        return 1 + max(custom)
+    others = [r.episode for r in of_split if r.suite or r.env not in (None, ROBOMME)]
+    if others and not any(record.task in TASK_FACTS for record in records):
+        return 1 + max(others)
     known = {**FURTHER_SPLITS, HARD: HARD_EPISODES}
     counts = {known.get(str(record.split), TEST_EPISODES) for record in of_split}
     return counts.pop() if len(counts) == 1 else TEST_EPISODES
@@ -329,7 +330,7 @@ def show_tables(
             print_table(table, Console().width)
             blocks.append(to_markdown(table))
             sections.append(Section(table.title, tables=[table]))
-    notes += limit_notes(records)
+    notes += setting_notes(records)
     notes += mixed_settings(find_records(args.runs))
     errors = sum(record.outcome == "error" for record in merge(records, args.conflicts))
     if errors:

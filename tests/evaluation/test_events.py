@@ -494,6 +494,16 @@ def test_a_matched_arm_of_another_step_limit_is_noted(
     assert "Step limits differ: 1300 in m, " in capsys.readouterr().out
 
 
+def test_an_event_without_its_matched_arm_is_named() -> None:
+    made = [*under("pause:50", [1, 0]), *under(None, [1, 0]), *under("gap:4", [0, 1])]
+    lonely = [replace(record, model="lonely") for record in under("pause:50", [1, 1])]
+    notes = event_table([*made, *lonely]).notes
+    assert [note for note in notes if "is not here" in note] == [
+        "lonely, checkpoint 1, seed 7, test, event pause:50: left out of the pairs, for the same"
+        " run without it is not here."
+    ]
+
+
 def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     won = {None: ([1, 1, 1, 1], [1, 1, 0, 0]), "pause:64": ([0, 0, 0, 1], [1, 0, 1, 0])}
     made = [

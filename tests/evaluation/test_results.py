@@ -18,11 +18,16 @@ from helpers.rollout_fakes import save_records
 from mme_vla import UserError, cli
 from mme_vla.cli.results import main
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results import paper, plots
 from mme_vla.evaluation.results.aggregate import Results, aggregate
 from mme_vla.evaluation.results.compare import compare, compare_all
 from mme_vla.evaluation.results.paper import demo_records
-from mme_vla.evaluation.results.report import conclude, policy_facts, training_details
+from mme_vla.evaluation.results.report import (
+    conclude,
+    html_report,
+    policy_facts,
+    training_details,
+)
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS, Protocol, tasks_of
 from mme_vla.evaluation.results.statistics import (
     estimate,
@@ -492,6 +497,57 @@ def test_step_limits_that_differ_are_noted() -> None:
     assert note.startswith("Step limits differ: 1300 in a, ") and "; 20 in b, " in note
     equal = aggregate([*first, *second], Protocol.of_records(first)).notes
     assert not any("Step limits" in note for note in equal)
+
+
+def test_environments_and_action_spaces_that_differ_are_noted() -> None:
+    first = records("a", {"Stack": [1, 0]}, env="lab", action_space="ee_pose")
+    second = records("b", {"Stack": [1, 0]}, env="other_lab")
+    notes = "\n".join(aggregate([*first, *second]).notes)
+    assert "Environments differ: lab in a, " in notes and "; other_lab in b, " in notes
+    assert "Action spaces differ: ee_pose in a, " in notes
+    assert not any("differ: " in note for note in aggregate(first).notes)
+
+
+def test_choices_beside_the_papers_numbers_are_noted() -> None:
+    def has_note(space: str) -> bool:
+        made = [replace(record, action_space=space) for record in records("pi05", {"BinFill": [1]})]
+        notes = aggregate(made, Protocol.of_records(made)).notes
+        return any(note.startswith("pi05 chose among options") for note in notes)
+
+    assert has_note("multi_choice") and not has_note("joint_angle")
+
+
+def test_a_task_of_an_environment_without_suites_has_as_many_episodes_as_recorded(
+    tmp_path: Path,
+) -> None:
+    save_records(tmp_path, records("a", {"Stack": [1, 0]}, env="lab"))
+    page = tmp_path / "page.html"
+    main([str(tmp_path), "--html", str(page)])
+    text = page.read_text()
+    assert "1 run of Stack × 2 episodes" in text and "Pale" not in text
+
+
+def test_the_curve_over_budgets_leaves_out_events_and_draws_runs_that_all_failed() -> None:
+    failed = [replace(r, outcome="fail") for r in demo_records([("framesamp_modul", None)])]
+    made = [*failed, *(replace(record, memory_budget=256) for record in failed)]
+    made += [replace(record, event="pause:100", outcome="success") for record in failed]
+    results = aggregate(made)
+    points = plots.budget_points(results.methods, 512)
+    (curve,) = points.values()
+    assert [(budget, figure.mean) for budget, figure in curve] == [(256, 0), (512, 0)]
+    assert "Memory budget" in html_report(results, [], "All failed")
+
+
+def test_configurations_of_one_budget_have_a_curve_each() -> None:
+    made = demo_records([("framesamp_modul", None)])
+    pairs = [replace(record, composition="aaaa", memory_budget=256) for record in made]
+    pairs += [replace(record, composition="bbbb", memory_budget=256) for record in made]
+    points = plots.budget_points(aggregate([*made, *pairs]).methods, 512)
+    assert {name: [budget for budget, _ in curve] for name, curve in points.items()} == {
+        "framesamp_modul": [512],
+        "framesamp_modul#aaaa": [256],
+        "framesamp_modul#bbbb": [256],
+    }
 
 
 def test_every_figure_of_tasks_with_unequal_numbers_of_episodes_is_a_mean_over_tasks() -> None:

@@ -28,6 +28,23 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
     assert mine[0].interval.low < 100 == mine[0].interval.high and len(stress_figures(curves)) == 1
 
 
+def test_twins_of_a_stress_split_have_a_curve_of_their_own() -> None:
+    made = []
+    for split, won in (
+        ("test", [1, 0]),
+        ("stress:count=2", [0, 0]),
+        ("twin", [1, 1]),
+        ("twin:stress:count=2", [1, 0]),
+    ):
+        made += records(split, won)
+    curves = stress_curves(made)
+    assert {run.rpartition(", ")[2]: {at: str(p) for at, p in points.items()}
+            for (run, *_), points in curves.items()} == {
+        "test": {0: "1/2", 2: "0/2"},
+        "twin": {0: "2/2", 2: "1/2"},
+    }  # fmt: skip
+
+
 def test_two_configurations_of_one_name_have_a_curve_each() -> None:
     stress_records = []
     for composition, won in (("first", 1), ("second", 0)):

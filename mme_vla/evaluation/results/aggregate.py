@@ -8,11 +8,13 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from mme_vla.config.naming import DEFAULT_BUDGET
+from mme_vla.envs.base import CHOICES
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.metadata import BASE, base_of
 from mme_vla.envs.rows import DIFFICULTIES
@@ -510,21 +512,32 @@ def _check_environments(records: Sequence[EpisodeRecord]) -> None:
         )
 
 
-def limit_notes(records: Iterable[EpisodeRecord]) -> list[str]:
-    """A sentence where a task was run with several step limits, variants of a split included."""
-    limits: dict[tuple[str, str], dict[int, RunKey]] = {}
+_SETTINGS = {
+    "max_steps": ("Step limits", "Episodes that need more steps fail under the smaller one."),
+    "action_space": ("Action spaces", "A task is not equally hard by each."),
+    "env": ("Environments", "Episodes of one number may be different ones."),
+}
+"""Field of records → what it is, and why results that differ in it are not alike."""
+
+
+def setting_notes(records: Iterable[EpisodeRecord]) -> list[str]:
+    """A sentence where a task was run with several step limits, action spaces or environments,
+    variants of a split included.
+    """
+    runs: dict[tuple[str, str, str], dict[Any, RunKey]] = {}
     for record in records:
-        of_task = limits.setdefault((base_of(record.split), record.task), {})
-        of_task.setdefault(record.max_steps, record.run)
+        for name in _SETTINGS:
+            value = getattr(record, name)
+            if value is not None:
+                of_task = runs.setdefault((name, base_of(record.split), record.task), {})
+                of_task.setdefault(value, record.run)
     notes: list[str] = []
-    for of_task in limits.values():
+    for (name, *_), of_task in runs.items():
         if len(of_task) > 1:
-            listed = "; ".join(f"{limit} in {run}" for limit, run in of_task.items())
-            notes.append(
-                f"Step limits differ: {listed}. Episodes that need more steps fail under the"
-                " smaller one."
-            )
-    return list(dict.fromkeys(notes))  # tasks of the same limits share one
+            what, effect = _SETTINGS[name]
+            listed = "; ".join(f"{value} in {run}" for value, run in of_task.items())
+            notes.append(f"{what} differ: {listed}. {effect}")
+    return list(dict.fromkeys(notes))  # tasks of the same settings share one
 
 
 def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[str]:
@@ -555,6 +568,11 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
                 f"{method.label} ran with a limit of {limit_text} steps; the paper's is"
                 f" {MAX_STEPS}."
             )
+        if method.paper and any(r.action_space == CHOICES for r in method.table["record"]):
+            notes.append(
+                f"{method.label} chose among options ({CHOICES}); the paper's policies move the"
+                " robot themselves."
+            )
         if len(method.runs) > 1:
             same = pair([run.episodes for run in method.runs])
             if same.left_out:
@@ -563,7 +581,7 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
                     f" {counted(same.left_out, 'episode')}: the scenes differ or only some runs"
                     " name them; its mean is over all of them."
                 )
-    notes += limit_notes(record for method in methods for record in method.table["record"])
+    notes += setting_notes(record for method in methods for record in method.table["record"])
     splits = set()
     for method in methods:
         splits |= {record.split for record in method.table["record"] if record.task in TASK_FACTS}

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from mme_vla.config.naming import digest
-from mme_vla.envs.metadata import BASE, read_variant
+from mme_vla.envs.metadata import BASE, TWIN, read_variant
 from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
 from mme_vla.errors import require
 from mme_vla.evaluation.pairing import pair
@@ -84,14 +84,15 @@ def stress_curves(
     records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
 ) -> Curves:
     """Success over every dial that records were made with; records of the test split are at its
-    zero.
+    zero. Twins have curves of their own.
     """
 
     def place(record: EpisodeRecord) -> Place:
         variant = read_variant(record.split)
         if variant is None or not variant.dial:
             return Place(record.run)
-        return Place(record.run._replace(split=BASE), variant.dial, variant.turned)
+        zero = record.run._replace(split=TWIN if variant.twin else BASE)
+        return Place(zero, variant.dial, variant.turned)
 
     curves = curves_of(merge(records, conflicts), place, confidence)
     require(

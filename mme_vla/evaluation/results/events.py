@@ -77,7 +77,10 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
     notes: list[str] = []
     for run, disturbed in runs.items():
         matched = runs.get(run._replace(event=None), {})
-        if run.event is None or not matched:
+        if run.event is None:
+            continue
+        if not matched:
+            notes.append(f"{run}: left out of the pairs, for the same run without it is not here.")
             continue
         pairing = pair([disturbed, matched])
         notes += pairing.notes(str(run))
@@ -101,7 +104,7 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
         rules.add(len(rows))
     columns = [
         "run", "event", "task", "trainings", "pairs", "without (%)", "with (%)", "kept", "lost",
-        "gained", "p", "did not act",
+        "gained", "p, uncorrected", "did not act",
     ]  # fmt: skip
     return Table(
         "Events beside their matched arms", columns, rows, rules - {len(rows)}, notes=notes

@@ -78,7 +78,7 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
                         textcoords="offset points",
                         fontsize=8,
                     )
-            axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)
+            axes.errorbar(xs, heights, gaps, fmt="none", ecolor=INK, elinewidth=0.9)
         if lines:
             at, means = np.array(lines).T
             half = 0.46 * width
@@ -212,13 +212,13 @@ _FAMILY_NAMES = {
 }
 
 
-def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) -> str:
+def budget_curve(points: dict[str, list[tuple[int, Figure]]]) -> str:
     """Success over the memory budget: the paper's sweep dashed, one's own models with their
     intervals.
 
     points: as `budget_points` gives them.
     """
-    order = list(dict.fromkeys(method.key.model for method in results.methods))
+    order = list(points)
     with figure((5.6, 3.9)) as (canvas, (axes,)):
         table = paper.paper_table("memory_budget")
         budgets = [int(row["memory_tokens"]) for row in table]
@@ -261,18 +261,19 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
 
 def budget_points(methods: Sequence[Method], default: int) -> dict[str, list[tuple[int, Figure]]]:
     """The average at each budget, ascending, of every model with a sweep, or that the paper swept;
-    complete only.
+    complete only. Runs with events are left out. Where a budget has several configurations of a
+    model, each has a curve of its own.
     """
     points: dict[str, list[tuple[int, Figure]]] = {}
     for method in methods:
-        if method.average.mean is not None:
-            points.setdefault(method.key.model, []).append(
-                (method.key.memory_budget or default, method.average)
-            )
+        if method.average.mean is not None and method.key.event is None:
+            budget = method.key.memory_budget
+            name = method.label.replace(f"@{budget}", "")
+            points.setdefault(name, []).append((budget or default, method.average))
     sweeps = {}
     for model, model_points in points.items():
         budgets = {budget for budget, _ in model_points}
-        if len(budgets) > 1 or model in SWEPT:
+        if len(budgets) > 1 or model.partition("#")[0] in SWEPT:
             sweeps[model] = sorted(model_points, key=lambda point: point[0])
     return sweeps
 
@@ -297,4 +298,5 @@ def _with_intervals(
             gaps.append(
                 (estimate.mean - estimate.interval.low, estimate.interval.high - estimate.mean)
             )
-    return places, means, np.array(gaps).reshape(-1, 2).T
+    # An interval of equal outcomes ends at their mean, but for rounding.
+    return places, means, np.maximum(gaps, 0).reshape(-1, 2).T

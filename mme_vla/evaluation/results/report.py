@@ -143,7 +143,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
         if chart := plots.efficiency(results, chunk_flops()):
             sections.append(Section("Efficiency", chart, caption=rings, half=bool(points)))
     if points:
-        curve = plots.budget_curve(results, points)
+        curve = plots.budget_curve(points)
         sections.append(
             Section("Memory budget", curve, caption="Dashed: the paper's sweep.", half=True)
         )
