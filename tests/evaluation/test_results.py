@@ -22,12 +22,7 @@ from mme_vla.evaluation.results import paper, plots
 from mme_vla.evaluation.results.aggregate import Results, aggregate
 from mme_vla.evaluation.results.compare import compare, compare_all
 from mme_vla.evaluation.results.paper import demo_records
-from mme_vla.evaluation.results.report import (
-    conclude,
-    html_report,
-    policy_facts,
-    training_details,
-)
+from mme_vla.evaluation.results.report import conclude, policy_facts, training_details
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS, Protocol, tasks_of
 from mme_vla.evaluation.results.statistics import (
     estimate,
@@ -528,21 +523,22 @@ def test_a_task_of_an_environment_without_suites_has_as_many_episodes_as_recorde
 
 
 def test_the_curve_over_budgets_leaves_out_events_and_draws_runs_that_all_failed() -> None:
-    failed = [replace(r, outcome="fail") for r in demo_records([("framesamp_modul", None)])]
+    failed = records("framesamp_modul", {"BinFill": [0] * 7})
     made = [*failed, *(replace(record, memory_budget=256) for record in failed)]
     made += [replace(record, event="pause:100", outcome="success") for record in failed]
-    results = aggregate(made)
-    points = plots.budget_points(results.methods, 512)
+    points = plots.budget_points(aggregate(made, Protocol.of_records(made)).methods, 512)
     (curve,) = points.values()
     assert [(budget, figure.mean) for budget, figure in curve] == [(256, 0), (512, 0)]
-    assert "Memory budget" in html_report(results, [], "All failed")
+    assert "<svg" in plots.budget_curve(points)
 
 
 def test_configurations_of_one_budget_have_a_curve_each() -> None:
-    made = demo_records([("framesamp_modul", None)])
-    pairs = [replace(record, composition="aaaa", memory_budget=256) for record in made]
-    pairs += [replace(record, composition="bbbb", memory_budget=256) for record in made]
-    points = plots.budget_points(aggregate([*made, *pairs]).methods, 512)
+    made = records("framesamp_modul", {"BinFill": [1, 0]})
+    for composition in ("aaaa", "bbbb"):
+        made += records(
+            "framesamp_modul", {"BinFill": [1, 1]}, composition=composition, memory_budget=256
+        )
+    points = plots.budget_points(aggregate(made, Protocol.of_records(made)).methods, 512)
     assert {name: [budget for budget, _ in curve] for name, curve in points.items()} == {
         "framesamp_modul": [512],
         "framesamp_modul#aaaa": [256],
