@@ -845,18 +845,29 @@ def test_standing_baselines_are_below_a_line_in_the_tables() -> None:
     assert table.rules == {2}
 
 
-def test_folders_of_one_run_with_other_settings_are_named(
+def test_folders_with_other_settings_and_rules_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = {"model": "m", "checkpoint": 1, "seed": 7, "policy": "p", "source": "here"}
-    for folder, execute in (("one", 16), ("same", 16), ("other", 4)):
-        begin_run(tmp_path / folder, {**settings, "execute": execute, "source": folder})
-        save_records(tmp_path / folder, run_of("test", [1]))
-    main([str(tmp_path / "one"), str(tmp_path / "same"), "--brief", "--samples", "20"])
-    assert "other settings" not in capsys.readouterr().out
-    main([str(tmp_path), "--brief", "--samples", "20"])
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "m, checkpoint 1, seed 7: one run here" in printed and "(execute 16 and 4)" in printed
+    settings = {"model": "m", "checkpoint": 1, "split": "test", "policy": "p", "execute": 16}
+    for folder, seed, more in (
+        ("one", 7, {"source": "here"}),
+        ("same", 7, {"source": "there"}),
+        ("seed", 42, {"execute": 4}),
+        ("rival", 7, {"model": "rival", "execute": 8, "max_actions": 20}),
+    ):
+        begin_run(tmp_path / folder, {**settings, "seed": seed, **more})
+        made = run_of("test", [1], str(more.get("model", "m")))
+        save_records(tmp_path / folder, [replace(record, model_seed=seed) for record in made])
+
+    def notes(*folders: str) -> str:
+        main([*(str(tmp_path / folder) for folder in folders), "--brief"])
+        return " ".join(capsys.readouterr().out.split())
+
+    assert "settings" not in notes("one", "same")
+    assert "m, test: its folders have other settings (execute 16 and 4)." in notes("one", "seed")
+    printed = notes("one", "rival")
+    assert "Rules of runs on test differ: max_actions 20 and none." in printed
+    assert "settings" not in printed
 
 
 def test_a_command_prints_a_warning_without_its_place_in_the_code(

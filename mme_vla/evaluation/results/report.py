@@ -275,28 +275,41 @@ def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:
     return [read_run(folder) for folder in folders if (folder / RUN_FILE).is_file()]
 
 
-# Settings of a run that its records have too, or that they follow from
-_NAMES = ["model", "checkpoint", "seed", "split", "event", "policy", "subgoal.name"]
+# Settings that runs of one model may differ in without a note, and those of the first that tell
+# its runs that are averaged from others
+_IDENTITY = ["model", "split", "event", "subgoal.name", "checkpoint", "seed", "policy", "source"]
+_AVERAGED = _IDENTITY[:4]
+_RULES = ["max_actions", "only_possible"]
 
 
 def mixed_settings(records: Iterable[Path]) -> list[str]:
-    """A sentence for each run whose files are of folders with different settings."""
-    runs = [run["settings"] for run in read_runs(records)]
-    table = pd.DataFrame([flat(run) for run in runs if "policy" in run])  # not of a player
-    # A checkpoint may be at several places.
-    table = table.reindex(columns=[*_NAMES, *table.columns.difference([*_NAMES, "source"])])
+    """A sentence for each model whose folders have several settings, and for each split whose runs
+    have several rules.
+    """
+    runs = [flat(run["settings"]) for run in read_runs(records) if "policy" in run["settings"]]
+    table = pd.DataFrame(runs, dtype=object)  # without players
+    others = table.columns.difference([*_IDENTITY, *_RULES, "max_steps"])  # records have that
+    table = table.reindex(columns=[*_IDENTITY, *_RULES, *others]).astype(str)
     notes = []
-    for (model, checkpoint, seed, *_), members in table.astype(str).groupby(_NAMES):
-        differing = members.loc[:, members.nunique() > 1]
-        values = "; ".join(
-            f"{key} {' and '.join(sorted(set(differing[key])))}" for key in differing
-        )
-        if values:
+    for (model, split, *_), members in table.groupby(_AVERAGED):
+        if values := _differing(members[others]):
             notes.append(
-                f"{model}, checkpoint {checkpoint}, seed {seed}: one run here, though its folders"
-                f" have other settings ({values}). Name one of the folders."
+                f"{model}, {split}: its folders have other settings ({values}). Name those of one"
+                " setting."
             )
+    for split, members in table.groupby("split"):
+        if values := _differing(members[_RULES]):
+            notes.append(f"Rules of runs on {split} differ: {values}.")
     return notes
+
+
+def _differing(settings: pd.DataFrame) -> str:
+    """The settings that have several values, and these."""
+    parts = []
+    for key in settings.columns[settings.nunique() > 1]:
+        values = settings[key].replace("nan", "none")
+        parts.append(f"{key} {' and '.join(sorted(set(values)))}")
+    return "; ".join(parts)
 
 
 def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]]) -> str:
