@@ -96,8 +96,8 @@ def separations(board: Board) -> Table:
     """Tasks and budgets at which memories differ, the clearest first."""
     rows = []
     for s in sorted(board.separations, key=lambda s: (s.p, -s.deviation)):
-        above = None if s.floor is None else abs(s.mean - s.floor)
-        below = None if s.ceiling is None else abs(s.mean - s.ceiling)
+        above = None if s.floor is None else round(s.mean - s.floor)
+        below = None if s.ceiling is None else round(s.ceiling - s.mean)
         over_trainings = "–" if s.p_repeated is None else f"{show_p(s.p_repeated)} ({s.repeated})"
         rows.append(
             [
@@ -109,8 +109,8 @@ def separations(board: Board) -> Table:
                 _cell(s.noise, ".1f"),
                 show_p(s.p),
                 over_trainings,
-                _cell(above, ".0f"),
-                _cell(below, ".0f"),
+                _cell(above, "d"),
+                _cell(below, "d"),
             ]
         )
     columns = [

@@ -220,6 +220,16 @@ def test_separations_state_deviation_noise_floor_and_ceiling(board: Board) -> No
     )
 
 
+def test_memories_below_the_floor_have_a_negative_distance_to_it(
+    board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = board.separations[0]
+    below = replace(first, mean=57.4, floor=85.0, ceiling=50.0)
+    monkeypatch.setattr(board, "separations", [below])
+    (row,) = board_page.separations(board).rows
+    assert row[-2:] == ["-28", "-7"]
+
+
 def test_variants_are_compared_that_differ_in_memory_or_integration_alone(
     rows: Path, tmp_path: Path
 ) -> None:
