@@ -47,6 +47,22 @@ def test_the_full_backbone_has_as_many_parameters_as_its_file_and_the_recipe_sta
     assert f"the {billions:.1f} B-parameter backbone" in text_of(DOCS / "train" / "full-model.md")
 
 
+def test_the_page_of_costs_states_the_counts_of_the_shipped_table() -> None:
+    rows = csv.DictReader(text_of(REPOSITORY / "mme_vla" / "assets" / "cost.csv").splitlines())
+    counts = {row["model"]: row for row in rows}
+    page = text_of(DOCS / "evidence" / "cost.md")
+    page = page.partition("## FLOPs")[2].partition("### Over the budget")[0]
+    stated = re.findall(r"^\| `(\w+)` \|[^|]*\|([^|]*)\|([^|]*)\|([^|]*)\|", page, re.MULTILINE)
+    assert len(stated) > 20
+    for model, *cells in stated:
+        row = counts[model]
+        assert [cell.strip() for cell in cells] == [
+            f"{int(row['parameters']) / 1e6:,.1f} M",
+            f"{int(row['forward']) / 1e12:.3f} T",
+            f"{int(row['chunk']) / 1e12:.3f} T",
+        ], model
+
+
 def test_files_of_data_name_the_folder_of_vision_caches() -> None:
     for name in ("sample", "robomme"):
         comment = f"null: `{default_cache_root().name}` in $MME_VLA_CACHE, else in"
