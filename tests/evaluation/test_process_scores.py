@@ -23,7 +23,7 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
-from mme_vla.evaluation.results.curves import process_of, process_tables
+from mme_vla.evaluation.results.curves import process_tables
 from mme_vla.evaluation.results.report import html_report
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.registry import TASKS
@@ -103,9 +103,10 @@ def make_reporting_env(
 def test_records_tables_and_the_report_tell_it() -> None:
     policy = quick_policy("pi05").eval()
     (record,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs(base=make_reporting_env))
-    assert process_of(record) == ProcessScore(0, 1, "stuck", "", "push")
+    assert record.process is not None
+    assert ProcessScore.from_dict(record.process) == ProcessScore(0, 1, "stuck", "", "push")
     (silent,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs())
-    assert process_of(silent) is None
+    assert silent.process is None
     scores = [
         ProcessScore(1, 4, "wrong", "how many", "x"),
         ProcessScore(3, 4, "stuck", "", "y"),

@@ -247,11 +247,6 @@ CAPTION = (
 )
 
 
-def process_of(record: EpisodeRecord) -> ProcessScore | None:
-    """The score in a record; None for episodes whose environment reports none."""
-    return None if record.process is None else ProcessScore.from_dict(record.process)
-
-
 def process_tables(results: Results) -> list[Table]:
     """Where the chains broke, a table of every method that has scores, over all its runs."""
     columns = ["", "episodes", "progress (%)", "success", *OPERATIONS, MOTION, "stuck"]
@@ -262,8 +257,8 @@ def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
     progress: list[float] = []
     ends: Counter[str] = Counter()
     for record in records:
-        score = process_of(record)
-        if score is not None:
+        if record.process is not None:
+            score = ProcessScore.from_dict(record.process)
             progress.append(score.done / max(score.of, 1))
             ends[score.operation or score.broke or "success"] += 1
     counts = [str(ends[kind] or "–") for kind in ("success", *OPERATIONS, MOTION, "stuck")]

@@ -275,10 +275,8 @@ def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:
     return [read_run(folder) for folder in folders if (folder / RUN_FILE).is_file()]
 
 
-# Settings that runs of one model may differ in without a note, and those of the first that tell
-# its runs that are averaged from others
+# Settings that differ between runs of a model; those of the first four are never averaged
 _IDENTITY = ["model", "split", "event", "subgoal.name", "checkpoint", "seed", "policy", "source"]
-_AVERAGED = _IDENTITY[:4]
 _RULES = ["max_actions", "only_possible"]
 
 
@@ -291,25 +289,19 @@ def mixed_settings(records: Iterable[Path]) -> list[str]:
     others = table.columns.difference([*_IDENTITY, *_RULES, "max_steps"])  # records have that
     table = table.reindex(columns=[*_IDENTITY, *_RULES, *others]).astype(str)
     notes = []
-    for (model, split, *_), members in table.groupby(_AVERAGED):
-        if values := _differing(members[others]):
-            notes.append(
-                f"{model}, {split}: its folders have other settings ({values}). Name those of one"
-                " setting."
+    for names, columns, text in (
+        (_IDENTITY[:4], others, "{}: its folders have other settings ({}). Name those of one."),
+        (["split"], _RULES, "Rules of runs on {} differ: {}."),
+    ):
+        for key, members in table.groupby(names):
+            settings = members[columns]
+            settings = settings.loc[:, settings.nunique() > 1].replace("nan", "none")
+            values = "; ".join(
+                f"{name} {' and '.join(sorted(set(settings[name])))}" for name in settings
             )
-    for split, members in table.groupby("split"):
-        if values := _differing(members[_RULES]):
-            notes.append(f"Rules of runs on {split} differ: {values}.")
+            if values:
+                notes.append(text.format(", ".join(key[:2]), values))
     return notes
-
-
-def _differing(settings: pd.DataFrame) -> str:
-    """The settings that have several values, and these."""
-    parts = []
-    for key in settings.columns[settings.nunique() > 1]:
-        values = settings[key].replace("nan", "none")
-        parts.append(f"{key} {' and '.join(sorted(set(values)))}")
-    return "; ".join(parts)
 
 
 def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]]) -> str:

@@ -26,7 +26,6 @@ class Task(NamedTuple):
     """The paper's facts of a task.
 
     memory: what has to be remembered: T(ime), S(pace), O(bject), P(rocedure).
-    video: whether a conditioning video comes first.
     steps: mean length of a demonstration.
     """
 
@@ -34,32 +33,31 @@ class Task(NamedTuple):
     suite: str
     memory: tuple[str, ...]
     group: str
-    video: bool
     steps: int
 
 
-def _task(name: str, suite: int, memory: str, group: int, video: bool, steps: int) -> Task:
-    return Task(name, SUITES[suite], tuple(memory.split("+")), GROUPS[group], video, steps)
+def _task(name: str, suite: int, memory: str, group: int, steps: int) -> Task:
+    return Task(name, SUITES[suite], tuple(memory.split("+")), GROUPS[group], steps)
 
 
 # In the benchmark's own order, which also numbers the environments' seeds.
 _TASKS = (
-    _task("PickXtimes", 0, "T", 5, False, 538),
-    _task("StopCube", 0, "T", 1, False, 317),
-    _task("SwingXtimes", 0, "T", 0, False, 435),
-    _task("BinFill", 0, "T", 5, False, 604),
-    _task("VideoUnmaskSwap", 1, "S", 2, True, 348),
-    _task("VideoUnmask", 1, "S", 2, True, 217),
-    _task("ButtonUnmaskSwap", 1, "S", 4, False, 400),
-    _task("ButtonUnmask", 1, "S", 4, False, 267),
-    _task("VideoRepick", 2, "O+T", 2, True, 687),
-    _task("VideoPlaceButton", 2, "O+T", 3, True, 974),
-    _task("VideoPlaceOrder", 2, "O+T", 3, True, 1134),
-    _task("PickHighlight", 2, "O", 4, False, 346),
-    _task("InsertPeg", 3, "P+O", 0, True, 479),
-    _task("MoveCube", 3, "P", 5, True, 394),
-    _task("PatternLock", 3, "P", 0, True, 208),
-    _task("RouteStick", 3, "P", 0, True, 370),
+    _task("PickXtimes", 0, "T", 5, 538),
+    _task("StopCube", 0, "T", 1, 317),
+    _task("SwingXtimes", 0, "T", 0, 435),
+    _task("BinFill", 0, "T", 5, 604),
+    _task("VideoUnmaskSwap", 1, "S", 2, 348),
+    _task("VideoUnmask", 1, "S", 2, 217),
+    _task("ButtonUnmaskSwap", 1, "S", 4, 400),
+    _task("ButtonUnmask", 1, "S", 4, 267),
+    _task("VideoRepick", 2, "O+T", 2, 687),
+    _task("VideoPlaceButton", 2, "O+T", 3, 974),
+    _task("VideoPlaceOrder", 2, "O+T", 3, 1134),
+    _task("PickHighlight", 2, "O", 4, 346),
+    _task("InsertPeg", 3, "P+O", 0, 479),
+    _task("MoveCube", 3, "P", 5, 394),
+    _task("PatternLock", 3, "P", 0, 208),
+    _task("RouteStick", 3, "P", 0, 370),
 )
 TASK_FACTS: dict[str, Task] = {task.name: task for task in _TASKS}
 PAPER_ORDER = (
@@ -184,7 +182,7 @@ class Protocol:
         if task in TASK_FACTS:
             return TASK_FACTS[task]
         suite = self.task_suites.get(task, USER_SUITE)
-        return Task(task, suite, (), USER_SUITE, False, 0)
+        return Task(task, suite, (), USER_SUITE, 0)
 
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""
