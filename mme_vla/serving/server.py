@@ -280,7 +280,12 @@ class PolicyServer:
             begun = time.perf_counter()
             message = await self._read(body)
             del body
-            reply = await self.sessions.respond(name, message, begun)
+            # After the body nothing can come but the end of the connection.
+            leaving = asyncio.ensure_future(request.receive())
+            try:
+                reply = await self.sessions.respond(name, message, begun, leaving.done)
+            finally:
+                leaving.cancel()
             return Response(pack(reply), media_type=MSGPACK)
         except (HTTPException, UserError, BusyError):
             raise

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode, Failure
 from mme_vla.policy.identity import PolicyIdentity
@@ -42,6 +42,8 @@ from mme_vla.utils import safe_name
 LARGEST_ACTION = 1e4
 """Largest size of a number of an action: radians, metres and shares are far below."""
 _LONGEST_METADATA = 4000  # characters of a server's metadata, in a receipt
+_LASTING = ("identity", "robot", "sample_steps")
+"""Metadata of this library's server that stay as they are for a run."""
 _MS_KEYS = ("infer_ms", "infer_time_ms")
 """Where servers say how long they computed: openpi's in `server_timing`, RoboMME's beside the
 actions.
@@ -359,11 +361,25 @@ class RemotePolicy(Policy):
 
         A connection that is lost before the episode has begun is opened again: nothing was sent
         that counts.
+
+        Raises:
+            UserError: there is no server, or the policy behind it is another by now.
         """
         settings = self.protocol.choice.connection
 
         def begin() -> Connection:
             connection = self.protocol.open()
+            changed = []
+            if self._server["protocol"] == "mme_vla":
+                said = connection.metadata
+                changed += [key for key in _LASTING if said.get(key) != self.metadata.get(key)]
+            if changed:
+                connection.close()
+                raise UserError(
+                    f"{self._server['address']} serves another policy than at the start of this run:"
+                    f" {listed(changed)} of its metadata changed. Serve the first again and repeat"
+                    " the command, or choose another output."
+                )
             try:
                 self.protocol.begin(connection, frames)
             except UserError as error:
