@@ -145,11 +145,11 @@ class Session:
         if request.stored:
             return
         processor = policy.require_processor()
-        samples = processor.samples
+        window = processor.samples.window
         # An observation comes once a chunk, and the frames between two are not in it.
         require(
-            samples.window == 1 or not samples.consecutive,
-            f"This policy reads the last {samples.window} frames of every camera, and an"
+            window == 1 or not processor.samples.consecutive,
+            f"This policy reads the last {window} frames of every camera, and an"
             " observation is one frame: send all frames since the last request in lists"
             " (<camera>_rgb_list).",
         )

@@ -267,7 +267,7 @@ def test_a_run_does_not_go_on_with_another_policy_at_the_same_address(
         policy = connect(f"ws://127.0.0.1:{served.server.port}")
         run(policy, tmp_path, PICK[:1])
         served.server.metadata["identity"]["composition"] = "another"
-        with pytest.raises(UserError, match="another policy than at the start .* identity"):
+        with pytest.raises(UserError, match=r"another policy than at the start .* \(identity"):
             run(policy, tmp_path, PICK[:2])
         policy.close()
     assert len(read_records(tmp_path / "episodes.jsonl")) == 1

@@ -474,7 +474,7 @@ def test_frames_that_follow_each_other_are_not_made_of_single_observations(monke
     monkeypatch.setattr(policy.require_processor(), "samples", SampleSpec(window=2))
     front, wrist, state = course()[0]
     with Served(policy) as served, served.client() as client:
-        with pytest.raises(UserError, match="last 2 frames .*_rgb_list"):
+        with pytest.raises(UserError, match=r"last 2 frames .*_rgb_list"):
             client.infer(observation(front[-1], wrist[-1], state[-1]))
         client.infer(challenge(front, wrist, state, first=True))
 

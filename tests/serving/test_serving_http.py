@@ -42,7 +42,6 @@ def stays() -> bool:
     return False
 
 
-
 @pytest.fixture(scope="module")
 def policy():
     return serving_policy()

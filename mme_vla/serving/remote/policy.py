@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode, Failure
 from mme_vla.policy.identity import PolicyIdentity
@@ -42,8 +42,6 @@ from mme_vla.utils import safe_name
 LARGEST_ACTION = 1e4
 """Largest size of a number of an action: radians, metres and shares are far below."""
 _LONGEST_METADATA = 4000  # characters of a server's metadata, in a receipt
-_LASTING = ("identity", "robot", "sample_steps")
-"""Metadata of this library's server that stay as they are for a run."""
 _MS_KEYS = ("infer_ms", "infer_time_ms")
 """Where servers say how long they computed: openpi's in `server_timing`, RoboMME's beside the
 actions.
@@ -88,7 +86,6 @@ class RemoteEpisode(Episode):
         self._leading: list[np.ndarray] = []
         self._current: Mapping[str, Any] = {}
         self.connection: Connection | None = None
-        self._failure: Failure | None = None
 
     def observe(
         self,
@@ -148,10 +145,6 @@ class RemoteEpisode(Episode):
         self._n_video = 0
         self._leading = []
         return frames
-
-    @property
-    def failure(self) -> Failure | None:
-        return self._failure
 
     def fail(self, failure: Failure) -> None:
         """Note that this episode cannot continue, and close its connection."""
@@ -231,9 +224,7 @@ class RemotePolicy(Policy):
         self.detected: str | None = None
         try:
             if name == "auto":
-                detection = detect(choice)
-                name = detection.protocol
-                self.detected = detection.reason
+                name, self.detected = detect(choice)
             self.protocol: ServerProtocol = PROTOCOLS[name](choice, robot)
             first = open_patiently(self.protocol.open, choice.connection.open_s)
         except UserError:
@@ -369,16 +360,13 @@ class RemotePolicy(Policy):
 
         def begin() -> Connection:
             connection = self.protocol.open()
-            changed = []
-            if self._server["protocol"] == "mme_vla":
-                said = connection.metadata
-                changed += [key for key in _LASTING if said.get(key) != self.metadata.get(key)]
-            if changed:
+            identity = connection.metadata.get("identity")
+            if self.protocol.name == "mme_vla" and identity != self.metadata.get("identity"):
                 connection.close()
                 raise UserError(
-                    f"{self._server['address']} serves another policy than at the start of this run:"
-                    f" {listed(changed)} of its metadata changed. Serve the first again and repeat"
-                    " the command, or choose another output."
+                    f"{self._server['address']} serves another policy than at the start of this run"
+                    " (identity in its metadata). Serve the first again and repeat the command, or"
+                    " choose another output."
                 )
             try:
                 self.protocol.begin(connection, frames)
