@@ -99,6 +99,7 @@ class Episode:
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""
         self._executed = self._no_actions
+        self._failure: Failure | None = None
 
     def renew_stream(self, prompt: Tensor) -> None:
         """Begin the stream anew where the prompt, token ids [l], is another than before: its state
@@ -390,7 +391,7 @@ class Episode:
     @property
     def failure(self) -> Failure | None:
         """Why the policy could not act at the last decision; None where it could."""
-        return None
+        return self._failure
 
     def close(self) -> None:
         """End the episode: free what it holds outside of this process."""

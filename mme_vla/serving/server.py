@@ -203,7 +203,7 @@ class PolicyServer:
             """Check the key before anything of the body is read."""
             address = scope["client"]
             refusal = self._refusal(scope)
-            self.places.begin_request(address)
+            self.places.deadlines[address] = None
             try:
                 if refusal is None:
                     await app(scope, receive, send)
@@ -215,7 +215,7 @@ class PolicyServer:
                 seconds = KEEP_ALIVE_S
                 if refusal or scope["path"] in OPEN or scope["type"] == "websocket":
                     seconds = BRIEF_S
-                self.places.end_request(address, seconds)
+                self.places.deadlines[address] = time.monotonic() + seconds
 
         return guarded
 
@@ -246,7 +246,7 @@ class PolicyServer:
                 status = 409
             elif isinstance(error, BusyError):
                 status = 503
-            return PlainTextResponse(f"{error_text(error)}\n", status)
+            return PlainTextResponse(f"{error}\n", status)
         path = request.url.path
         text = error.detail
         if error.status_code == 404:
@@ -280,14 +280,19 @@ class PolicyServer:
             begun = time.perf_counter()
             message = await self._read(body)
             del body
-            reply = await self.sessions.respond(name, message, begun)
+            # After the body nothing can come but the end of the connection.
+            leaving = asyncio.ensure_future(request.receive())
+            try:
+                reply = await self.sessions.respond(name, message, begun, leaving.done)
+            finally:
+                leaving.cancel()
             return Response(pack(reply), media_type=MSGPACK)
         except (HTTPException, UserError, BusyError):
             raise
         except Exception as error:
             self.stats.counts["failed"] += 1
             logger.exception("%s: failed", name[0])
-            return PlainTextResponse(f"{error_text(error)}\n", 500)
+            return PlainTextResponse(f"{failure_text(error)}\n", 500)
         finally:
             self.places.leave(place)
 
@@ -406,12 +411,12 @@ class PolicyServer:
         except UserError as error:
             self.stats.counts["refused"] += 1
             logger.info("%s: refused: %s", place.name, error)
-            return error_text(error)
+            return str(error)
         except Exception as error:
             session.intact = False
             self.stats.counts["failed"] += 1
             logger.exception("%s: failed", place.name)
-            return error_text(error)
+            return failure_text(error)
 
     async def _send(self, socket: WebSocket, reply: dict[str, Any] | str) -> None:
         """Send a reply, or a reason as text.
@@ -463,8 +468,10 @@ class Places:
         self.closing: set[asyncio.Task[None]] = set()
         """Closing frames that are being sent."""
         self.stopping = False
-        self._deadlines: dict[Any, float | None] = {}
-        """By client address, when a connection is cut; None while it has a request."""
+        self.deadlines: dict[Any, float | None] = {}
+        """By client address, when a connection is cut; None from the end of a request's headers to
+        its reply.
+        """
 
     def take(self, address: Any, socket: WebSocket | None = None) -> Place | None:
         """A place, or None if there is none."""
@@ -498,32 +505,24 @@ class Places:
         place.ended = True
         self.leave(place)
         if place.socket is None:
-            self._deadlines[place.address] = time.monotonic()
+            self.deadlines[place.address] = time.monotonic()
             return
-        self._deadlines[place.address] = time.monotonic() + BRIEF_S
+        self.deadlines[place.address] = time.monotonic() + BRIEF_S
         task = asyncio.get_running_loop().create_task(_close(place.socket, 1001, reason))
         self.closing.add(task)
         task.add_done_callback(self.closing.discard)
-
-    def begin_request(self, address: Any) -> None:
-        """Note that the headers of a request are complete."""
-        self._deadlines[address] = None
-
-    def end_request(self, address: Any, seconds: float) -> None:
-        """Note that a reply is sent, and how long the connection may wait for the next request."""
-        self._deadlines[address] = time.monotonic() + seconds
 
     def end_overdue(self, server: uvicorn.Server) -> None:
         """Cut connections that are past their time."""
         now = time.monotonic()
         connections: set[Any] = server.server_state.connections
         transports = {connection.client: connection.transport for connection in connections}
-        for address in list(self._deadlines):
+        for address in list(self.deadlines):
             if address not in transports:
-                del self._deadlines[address]
+                del self.deadlines[address]
         for address in transports:
-            self._deadlines.setdefault(address, now + BRIEF_S)
-        pending = [(end, address) for address, end in self._deadlines.items() if end is not None]
+            self.deadlines.setdefault(address, now + BRIEF_S)
+        pending = [(end, address) for address, end in self.deadlines.items() if end is not None]
         # Addresses are not compared: that of a client that left at once is None.
         pending.sort(key=lambda entry: entry[0], reverse=True)
         for number, (end, address) in enumerate(pending):
@@ -542,12 +541,8 @@ def _client(request: Request) -> str:
     return request.client.host if request.client else ""
 
 
-def error_text(error: Exception) -> str:
-    """What a client is told of an error: a mistake of its own in full, anything else without its
-    traceback.
-    """
-    if isinstance(error, UserError | BusyError):
-        return str(error)
+def failure_text(error: Exception) -> str:
+    """What a client is told of an error that is not its own; the traceback is in the log."""
     return f"The server failed on this request ({type(error).__name__}: {str(error)[:200]})."
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment.robomme import benchmark_action
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.policy.base import frames_a_piece
 from mme_vla.processing.normalise import check_reach
 from mme_vla.processing.prompt import subgoal_kind
@@ -101,6 +101,7 @@ class Session:
 
     async def _infer(self, request: Infer) -> np.ndarray:
         count = len(request.states)
+        self._check_states(request.states)  # before a first request ends the episode that was
         # A client that repeats its first request means the same episode, not a longer one.
         if request.first:
             self._begin()
@@ -108,7 +109,6 @@ class Session:
         self._check_course(request)
         if request.stored:
             self._check_capacity(count)
-        self._check_states(request.states)
         cameras = self._engine.policy.embodiment.camera_names
         self._check_sizes("observation", {name: request.views[name] for name in cameras})
         self.intact = False
@@ -144,12 +144,21 @@ class Session:
             )
         if request.stored:
             return
+        processor = policy.require_processor()
+        window = processor.samples.window
+        # An observation comes once a chunk, and the frames between two are not in it.
+        require(
+            window == 1 or not processor.samples.consecutive,
+            f"This policy reads the last {window} frames of every camera, and an"
+            " observation is one frame: send all frames since the last request in lists"
+            " (<camera>_rgb_list).",
+        )
         if n_observed == 0 and policy.memory is not None:
             raise UserError(
                 "This policy remembers past frames: send them with add_buffer, the current one"
                 " included."
             )
-        reads_actions = policy.require_processor().prompt_spec.past_actions > 0
+        reads_actions = processor.prompt_spec.past_actions > 0
         if reads_actions and self._n_frames_at_action == n_observed:
             raise UserError(
                 "This policy reads which actions were executed, one a frame: send the frames since"
@@ -239,9 +248,9 @@ class Session:
 
 Name = tuple[str, str]  # address and X-Session
 LOST = (
-    "There is no episode of yours here: it was never begun, an error ended it, it was silent for"
-    " too long, it gave its place to another on a full server, or the server was restarted. Reset"
-    " and begin the episode again."
+    "There is no episode of yours here: it was never begun, an error ended it, a reply was not"
+    " waited for, it was silent for too long, it gave its place to another on a full server, or the"
+    " server was restarted. Reset and begin the episode again."
 )
 
 
@@ -271,8 +280,14 @@ class HttpSessions:
         self._settings = settings
         self.entries: dict[Name, SessionEntry] = {}
 
-    async def respond(self, name: Name, request: Request, begun: float) -> dict[str, Any]:
+    async def respond(
+        self, name: Name, request: Request, begun: float, has_left: Callable[[], bool]
+    ) -> dict[str, Any]:
         """Reply to a request of a session, after those of the same session that came before.
+
+        Args:
+            has_left: whether the client does not wait for the reply any more. It cannot know
+                whether its frames were taken and may send them again: its episode ends.
 
         Raises:
             NoEpisodeError: the session has ended, or never began.
@@ -283,10 +298,13 @@ class HttpSessions:
         try:
             async with entry.lock:
                 if self.entries.get(name) is entry:
-                    return await entry.session.respond(request, begun)
+                    reply = await entry.session.respond(request, begun)
+                    if not _begins(request) and has_left():
+                        self.drop(name, entry)
+                    return reply
             # A request before this one failed and ended the session.
             if _begins(request):
-                return await self.respond(name, request, begun)
+                return await self.respond(name, request, begun, has_left)
             raise NoEpisodeError(LOST)
         except Exception as error:
             if not isinstance(error, UserError) or not entry.session.intact:

@@ -260,6 +260,19 @@ def test_a_server_that_never_gives_a_chunk_stops_the_run_with_its_reason(
         policy.close()
 
 
+def test_a_run_does_not_go_on_with_another_policy_at_the_same_address(
+    inline: None, tmp_path: Path
+) -> None:
+    with Served(serving_policy("pi05")) as served:
+        policy = connect(f"ws://127.0.0.1:{served.server.port}")
+        run(policy, tmp_path, PICK[:1])
+        served.server.metadata["identity"]["composition"] = "another"
+        with pytest.raises(UserError, match=r"another policy than at the start .* \(identity"):
+            run(policy, tmp_path, PICK[:2])
+        policy.close()
+    assert len(read_records(tmp_path / "episodes.jsonl")) == 1
+
+
 @pytest.mark.slow
 def test_a_run_whose_server_dies_is_continued_and_nothing_is_counted_twice(
     stubs: Any, inline: None, tmp_path: Path

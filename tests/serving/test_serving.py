@@ -25,6 +25,7 @@ from helpers.serving_fakes import (
     wait_until,
 )
 from mme_vla.errors import UserError
+from mme_vla.processing.base import SampleSpec
 from mme_vla.serving import Client, Limits, PolicyServer, ServeSettings, pack, unpack
 
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}  # batches of other sizes add the same numbers in another order
@@ -247,6 +248,7 @@ def test_a_refused_request_leaves_the_episode_as_it_was(policy):
             for message, reason in (
                 ({"front_rgb_list": 3}, "task_goal"),
                 (broken, "Check the driver and the units."),
+                ({**broken, "is_first_step": True}, "Check the driver and the units."),
                 (challenge(*small, *parts[1][2:], first=False), "had [64, 64] before"),
             ):
                 with pytest.raises(UserError, match=re.escape(reason)):
@@ -465,6 +467,16 @@ def test_past_actions_need_the_frames_they_led_to():
         client.infer(request)
         with pytest.raises(UserError, match="add_buffer"):
             client.infer(request)
+
+
+def test_frames_that_follow_each_other_are_not_made_of_single_observations(monkeypatch):
+    policy = serving_policy("pi05")
+    monkeypatch.setattr(policy.require_processor(), "samples", SampleSpec(window=2))
+    front, wrist, state = course()[0]
+    with Served(policy) as served, served.client() as client:
+        with pytest.raises(UserError, match=r"last 2 frames .*_rgb_list"):
+            client.infer(observation(front[-1], wrist[-1], state[-1]))
+        client.infer(challenge(front, wrist, state, first=True))
 
 
 def test_unpacked_metadata_is_the_first_message(served):

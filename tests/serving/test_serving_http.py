@@ -38,6 +38,10 @@ def choice(words: list[str]) -> PolicyChoice:
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}
 
 
+def stays() -> bool:
+    return False
+
+
 @pytest.fixture(scope="module")
 def policy():
     return serving_policy()
@@ -277,7 +281,7 @@ def test_a_request_that_waited_does_not_continue_with_an_episode_that_failed_mea
         first = sessions.find(name, Reset())
         await first.lock.acquire()
         waiting = asyncio.ensure_future(
-            sessions.respond(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0)
+            sessions.respond(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0, stays)
         )
         await asyncio.sleep(0)
         assert first.requests == 1
@@ -291,13 +295,29 @@ def test_a_request_that_waited_does_not_continue_with_an_episode_that_failed_mea
     assert served.on_loop(meet())
 
 
+def test_frames_are_not_taken_twice_from_a_client_that_gave_up_and_sends_them_again(policy):
+    parts = course()
+    with Served(policy, encode_chunk=1) as served:
+        body = pack(challenge(*parts[1], first=False))
+        ask(served, "POST", "/infer", pack(challenge(*parts[0], first=True)))
+        with served.reading() as state, socket.create_connection(served.address) as impatient:
+            head = f"POST /infer HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n"
+            impatient.sendall(head.encode() + body)
+            assert state.begun.wait(30)
+        status, _, reply = ask(served, "POST", "/infer", body)
+        assert status == 409 and b"waited for" in reply
+        np.testing.assert_allclose(
+            by_http(served, parts)[0], acted_directly(policy, parts)[0][:16], **CLOSE
+        )
+
+
 def test_a_reset_that_waited_begins_an_episode_that_later_requests_find(served):
     sessions, name = served.server.sessions, ("127.0.0.1", "again")
 
     async def meet():
         first = sessions.find(name, Reset())
         await first.lock.acquire()
-        waiting = asyncio.ensure_future(sessions.respond(name, Reset(), 0.0))
+        waiting = asyncio.ensure_future(sessions.respond(name, Reset(), 0.0, stays))
         await asyncio.sleep(0)
         sessions.drop(name)  # as an error of the request before it does
         first.lock.release()

@@ -121,7 +121,7 @@ def test_a_client_without_an_address_does_not_end_the_search_for_overdue_ones():
     places.end_overdue(uvicorn)  # all get the same time
     assert not cut
     for connection in connections:
-        places.end_request(connection.client, -1.0)
+        places.deadlines[connection.client] = time.monotonic() - 1
     places.end_overdue(uvicorn)
     assert sorted(map(str, cut)) == ["('127.0.0.1', 4000)", "('127.0.0.1', 4001)", "None"]
 

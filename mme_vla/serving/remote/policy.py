@@ -86,7 +86,6 @@ class RemoteEpisode(Episode):
         self._leading: list[np.ndarray] = []
         self._current: Mapping[str, Any] = {}
         self.connection: Connection | None = None
-        self._failure: Failure | None = None
 
     def observe(
         self,
@@ -146,10 +145,6 @@ class RemoteEpisode(Episode):
         self._n_video = 0
         self._leading = []
         return frames
-
-    @property
-    def failure(self) -> Failure | None:
-        return self._failure
 
     def fail(self, failure: Failure) -> None:
         """Note that this episode cannot continue, and close its connection."""
@@ -229,9 +224,7 @@ class RemotePolicy(Policy):
         self.detected: str | None = None
         try:
             if name == "auto":
-                detection = detect(choice)
-                name = detection.protocol
-                self.detected = detection.reason
+                name, self.detected = detect(choice)
             self.protocol: ServerProtocol = PROTOCOLS[name](choice, robot)
             first = open_patiently(self.protocol.open, choice.connection.open_s)
         except UserError:
@@ -359,11 +352,22 @@ class RemotePolicy(Policy):
 
         A connection that is lost before the episode has begun is opened again: nothing was sent
         that counts.
+
+        Raises:
+            UserError: there is no server, or the policy behind it is another by now.
         """
         settings = self.protocol.choice.connection
 
         def begin() -> Connection:
             connection = self.protocol.open()
+            identity = connection.metadata.get("identity")
+            if self.protocol.name == "mme_vla" and identity != self.metadata.get("identity"):
+                connection.close()
+                raise UserError(
+                    f"{self._server['address']} serves another policy than at the start of this run"
+                    " (identity in its metadata). Serve the first again and repeat the command, or"
+                    " choose another output."
+                )
             try:
                 self.protocol.begin(connection, frames)
             except UserError as error:

@@ -363,23 +363,15 @@ PROTOCOLS: Mapping[str, type[ServerProtocol]] = {
 }
 
 
-@dataclass(frozen=True)
-class Detection:
-    """The protocol of a server, and how it was recognised."""
-
-    protocol: str
-    reason: str
-
-
-def detect(choice: ServerChoice) -> Detection:
-    """Recognise the protocol of a server.
+def detect(choice: ServerChoice) -> tuple[str, str]:
+    """The protocol of a server, and how it was recognised.
 
     Raises:
         UserError: no server, or one with none of the protocols.
     """
     connection = choice.connection
     if choice.is_http:
-        return Detection("challenge", "it has HTTP")
+        return "challenge", "it has HTTP"
 
     # All but the harness's servers send their metadata first.
     settings: dict[str, Any] = {"api_key": connection.api_key, "timeout": connection.timeout_s}
@@ -389,19 +381,19 @@ def detect(choice: ServerChoice) -> Detection:
         client = open_patiently(connect, connection.open_s)
     except TimeoutError:
         HarnessConnection(choice.server, **settings, open_timeout=connection.open_s).close()
-        return Detection("harness", "it waits for a greeting and returns one")
+        return "harness", "it waits for a greeting and returns one"
     try:
         if ServerMetadata.of(client.metadata).server == SERVER_NAME:
-            return Detection("mme_vla", "its metadata say so")
+            return "mme_vla", "its metadata say so"
         try:
             reply = client.request({"reset": True})
         except (UserError, ConnectionError):
-            return Detection("openpi", "it knows no reset")
+            return "openpi", "it knows no reset"
         if "reset_finished" not in reply:
-            return Detection("openpi", "it takes a reset for an observation")
+            return "openpi", "it takes a reset for an observation"
         if "reset_time_ms" in reply:
-            return Detection("robomme", "it times a reset, as the released server")
-        return Detection("challenge", "it knows a reset, and does not time it")
+            return "robomme", "it times a reset, as the released server"
+        return "challenge", "it knows a reset, and does not time it"
     finally:
         client.close()
 
