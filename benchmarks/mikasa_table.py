@@ -31,12 +31,12 @@ import pandas as pd
 from mme_vla.errors import check_known, counted
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
+from mme_vla.evaluation.results.statistics import percentiles
 from mme_vla.evaluation.store import read_folders
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
 from mme_vla.extras.nano.board import Board, published_success, spearman
 from mme_vla.extras.nano.cli.board import published_rows
 from mme_vla.extras.nano.rows import CHOICES, read_rows, table_of
-from mme_vla.extras.probing.bootstrap import percentiles
 from mme_vla.utils import write_atomically
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))

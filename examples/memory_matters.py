@@ -38,7 +38,7 @@ import torch
 from mme_vla import build_policy
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.config.composition import compose
-from mme_vla.extras.probing.bootstrap import percentiles, resampled_means
+from mme_vla.evaluation.results.statistics import percentiles, resampled_means
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mme_vla.backbone.flow import FlowHead
-from mme_vla.extras.probing.bootstrap import resampled_means
+from mme_vla.evaluation.results.statistics import resampled_means
 from mme_vla.processing.prompt import PromptInput, State
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.training.order import BatchOrder, generator_for

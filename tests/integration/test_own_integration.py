@@ -2,15 +2,12 @@
 learns and acts.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 
 from helpers import REPOSITORY
-from mme_vla import MemoryTokens, MMEPolicy, build_policy
-from mme_vla.integration.base import required
+from mme_vla import MMEPolicy, build_policy
 from mme_vla.testing import check_integration
 from mme_vla.testing.small import open_gates, random_batch, unit_stats
 
@@ -37,21 +34,6 @@ def test_the_page_shows_the_files_that_are_tested() -> None:
 def test_it_keeps_an_integrations_contract(policy: MMEPolicy) -> None:
     check_integration("gist")
     check_integration("gist", memory="ttt")
-
-
-def test_a_mean_over_no_valid_token_is_reported(
-    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A probe takes all tokens away (`drop:all`)."""
-
-    def condition(self: Any, memory: MemoryTokens | None) -> Any:
-        memory = required(memory)
-        mean = memory.tokens.sum(1) / memory.mask.sum(1, keepdim=True)
-        return lambda condition: condition + self.to_condition(mean)
-
-    monkeypatch.setattr(type(policy.integration), "condition", condition)
-    with pytest.raises(AssertionError, match=r"no memory token is valid.*clamp\(min=1\)"):
-        check_integration("gist")
 
 
 def test_it_learns_and_acts(policy: MMEPolicy) -> None:

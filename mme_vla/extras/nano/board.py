@@ -27,10 +27,16 @@ from mme_vla.evaluation.results.compare import (
 )
 from mme_vla.evaluation.results.paper import PaperMethod
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
-from mme_vla.evaluation.results.statistics import Interval, holm, wilson
+from mme_vla.evaluation.results.statistics import (
+    Interval,
+    holm,
+    percentiles,
+    resampled_means,
+    sampled_interval,
+    wilson,
+)
 from mme_vla.extras.nano.rows import CHOICES, Trained, Training
 from mme_vla.extras.nano.unpaired import compare_unpaired
-from mme_vla.extras.probing.bootstrap import percentiles, resampled_means, sampled_interval
 
 SAMPLES = 2000
 """Of the bootstrap."""

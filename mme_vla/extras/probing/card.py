@@ -18,14 +18,18 @@ from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, displa
 from mme_vla.evaluation.results.baselines import is_standing, memory_of
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol, counted
-from mme_vla.evaluation.results.statistics import paired_interval
+from mme_vla.evaluation.results.statistics import (
+    paired_interval,
+    percentiles,
+    resampled_means,
+    sampled_interval,
+)
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, lacking, meanings_of, read_arm, slug
-from mme_vla.extras.probing.bootstrap import percentiles, resampled_means, sampled_interval
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.evidence import record_evidence
 from mme_vla.extras.probing.findings import Findings

@@ -18,6 +18,7 @@ from scipy.stats import kendalltau, spearmanr
 from helpers.nano_rows import SCENES, SPLIT, TASKS, records_of, write_records, write_training
 from mme_vla import UserError
 from mme_vla.envs.metadata import episodes
+from mme_vla.evaluation.results.statistics import percentiles
 from mme_vla.evaluation.store import begin_run, read_folders
 from mme_vla.extras.nano import board_page
 from mme_vla.extras.nano.board import Board, Row, homogeneity, kendall, pooled, smallest_p, spearman
@@ -25,7 +26,6 @@ from mme_vla.extras.nano.cli import board as board_command
 from mme_vla.extras.nano.cli import nano as nano_command
 from mme_vla.extras.nano.rows import read_rows, read_training
 from mme_vla.extras.nano.unpaired import unpaired_difference
-from mme_vla.extras.probing.bootstrap import percentiles
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import write_json
 
