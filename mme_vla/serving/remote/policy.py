@@ -360,8 +360,11 @@ class RemotePolicy(Policy):
 
         def begin() -> Connection:
             connection = self.protocol.open()
-            identity = connection.metadata.get("identity")
-            if self.protocol.name == "mme_vla" and identity != self.metadata.get("identity"):
+            identity = ServerMetadata.of(connection.metadata).identity
+            if (
+                self.protocol.name == "mme_vla"
+                and identity != ServerMetadata.of(self.metadata).identity
+            ):
                 connection.close()
                 raise UserError(
                     f"{self._server['address']} serves another policy than at the start of this run"
