@@ -17,15 +17,14 @@ class BackgroundEpisode(SubgoalEpisode):
     """An episode as the policy sees it.
 
     inner: the episode of the predictor, which may be busy with it. Frames are passed on later.
+    subgoal: the last answer; `queried` until `predict` has returned it.
     answered: whether there was an answer yet.
-    fresh: whether `subgoal` is an answer that `predict` has not returned yet.
     """
 
     def __init__(self, inner: SubgoalEpisode) -> None:
         super().__init__(inner.goal, inner.video, inner.task)
         self.inner = inner
         self.answered = False
-        self.fresh = False
         self._delayed: list[Callable[[], None]] = []
 
     def skip(self, count: int) -> None:
@@ -83,11 +82,8 @@ class BackgroundPredictor(SubgoalPredictor):
         self._ask(episodes)
         subgoals = []
         for episode in episodes:
-            subgoal = episode.subgoal
-            if not episode.fresh:
-                subgoal = Subgoal(subgoal.text, subgoal.points)
-            episode.fresh = False
-            subgoals.append(subgoal)
+            subgoals.append(episode.subgoal)
+            episode.subgoal = Subgoal(episode.subgoal.text, episode.subgoal.points)
         return subgoals
 
     def close(self) -> None:
@@ -125,5 +121,4 @@ class BackgroundPredictor(SubgoalPredictor):
             episode.subgoal = subgoal
             episode.query_step = episode.inner.query_step
             episode.answered = True
-            episode.fresh = True
         self._queried_episodes = []

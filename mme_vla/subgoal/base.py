@@ -14,7 +14,7 @@ import numpy as np
 
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.registry import SUBGOALS
-from mme_vla.subgoal.text import KINDS, MalformedReply, Parsed, Point
+from mme_vla.subgoal.text import KINDS, Point
 
 log = logging.getLogger(__name__)
 PROBLEMS = ("malformed", "empty", "refused", "failed")
@@ -169,18 +169,13 @@ class SubgoalPredictor:
         `usage.problems`, and the episode keeps its last subgoal.
         """
         due = [episode for episode in episodes if self.due(episode)]
+        for episode in episodes:
+            episode.subgoal = Subgoal(episode.subgoal.text, episode.subgoal.points)
         if due:
             for episode, subgoal in zip(due, self.predict_due(due), strict=True):
                 episode.subgoal = subgoal
                 episode.query_step = episode.step
-        queried = {id(episode) for episode in due}
-        subgoals = []
-        for episode in episodes:
-            subgoal = episode.subgoal
-            if id(episode) not in queried:
-                subgoal = Subgoal(subgoal.text, subgoal.points)
-            subgoals.append(subgoal)
-        return subgoals
+        return [episode.subgoal for episode in episodes]
 
     def due(self, episode: SubgoalEpisode) -> bool:
         """Return whether to ask now: for the first time, or a multiple of `interval` was passed."""
@@ -194,12 +189,7 @@ class SubgoalPredictor:
         """Ask for these episodes, all at once where that is possible."""
         raise NotImplementedError
 
-    def accepted(self, parsed: Parsed, reply: str) -> Subgoal:
-        return Subgoal(parsed.text, parsed.points, queried=True, reply=reply)
-
-    def unchanged(
-        self, episode: SubgoalEpisode, problem: str, reply: str = "", reason: str = ""
-    ) -> Subgoal:
+    def unchanged(self, episode: SubgoalEpisode, problem: str, reply: str, reason: str) -> Subgoal:
         """Return the episode's last subgoal, after an answer that cannot be used.
 
         The problem, one of `PROBLEMS`, is counted and logged.
@@ -213,11 +203,6 @@ class SubgoalPredictor:
         )
         last = episode.subgoal
         return Subgoal(last.text, last.points, queried=True, reply=reply, problem=problem)
-
-    def unreadable(self, episode: SubgoalEpisode, reply: str, error: MalformedReply) -> Subgoal:
-        """As `unchanged`, after a reply that is empty or malformed."""
-        problem = "malformed" if reply.strip() else "empty"
-        return self.unchanged(episode, problem, reply, str(error))
 
     def close(self) -> None:
         """Free what the predictor holds."""

@@ -14,7 +14,7 @@ from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import Question
 from mme_vla.subgoal.qwenvl import VLMPredictor
-from mme_vla.subgoal.text import MEMER_SYSTEM, MalformedReply, memer_user, parse_memer
+from mme_vla.subgoal.text import MEMER_SYSTEM, memer_user, parse_memer
 
 
 class MemerEpisode(SubgoalEpisode):
@@ -93,10 +93,7 @@ class Memer(VLMPredictor):
 
     def read(self, episode: MemerEpisode, reply: str) -> Subgoal:
         recent = episode.recent(self.recent, self.stride)
-        try:
-            parsed, positions = parse_memer(reply, len(recent))
-        except MalformedReply as error:
-            return self.unreadable(episode, reply, error)
+        parsed, positions = parse_memer(reply, len(recent))
         numbers = list(recent)
         keyframes = dict(episode.keyframes)
         for position in positions:  # from 1
@@ -104,4 +101,4 @@ class Memer(VLMPredictor):
             keyframes[number] = recent[number]
         merged = merge_keyframes(list(keyframes), self.merge_distance)
         episode.keyframes = {t: keyframes[t] for t in merged}
-        return self.accepted(parsed, reply)
+        return Subgoal(parsed.text, parsed.points, queried=True, reply=reply)

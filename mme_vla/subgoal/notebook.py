@@ -15,16 +15,9 @@ from mme_vla.config.sections import Range
 from mme_vla.errors import UserError, brief
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
-from mme_vla.subgoal.models.api import ApiFailure, MediaPart
+from mme_vla.subgoal.models.api import MediaPart
 from mme_vla.subgoal.prompted import CLIP, PromptedPredictor
-from mme_vla.subgoal.text import (
-    MalformedReply,
-    json_object,
-    numbered,
-    parse_gemini,
-    pixels_of_pairs,
-    says_done,
-)
+from mme_vla.subgoal.text import MalformedReply, json_object, numbered
 from mme_vla.subgoal.vocabulary import describe_subgoals, example_of
 from mme_vla.utils import is_text
 from mme_vla.utils.validation import validated
@@ -246,8 +239,8 @@ class NotebookEpisode(SubgoalEpisode):
 class NotebookPredictor(PromptedPredictor):
     """Asks the monitor whether the subgoal is complete, and only then the planner for the next one.
 
-    A question contains the notebook and the frames of the current subgoal, and no conversation. No
-    failure ends an episode: it keeps its subgoal and its notebook, and the problem is counted.
+    A question contains the notebook and the frames of the current subgoal, and no conversation.
+    After a failure the notebook stays as it was.
 
     Args:
         interval: steps between two questions to the monitor.
@@ -266,19 +259,11 @@ class NotebookPredictor(PromptedPredictor):
     ) -> None:
         super().__init__(kind, interval, workers, api, client, settings)
 
-    def _ask(self, episode: NotebookEpisode) -> Subgoal:
-        replies: list[str] = []
-        try:
-            last = episode.subgoal
-            if last.text is not None and not self._complete(episode, last.text, replies):
-                return Subgoal(last.text, last.points, queried=True, reply=replies[0])
-            return self._next(episode, replies)
-        except ApiFailure as failure:
-            problem, reason = failure.problem, str(failure)
-        except MalformedReply as error:
-            problem, reason = "malformed", str(error)
-        with self._lock:
-            return self.unchanged(episode, problem, "\n".join(replies), reason)
+    def _answer(self, episode: NotebookEpisode, replies: list[str]) -> Subgoal:
+        last = episode.subgoal
+        if last.text is not None and not self._complete(episode, last.text, replies):
+            return Subgoal(last.text, last.points, queried=True, reply=replies[0])
+        return self._next(episode, replies)
 
     def _complete(self, episode: NotebookEpisode, subgoal: str, replies: list[str]) -> bool:
         """Return whether the monitor has reported the subgoal as complete, now or before.
@@ -336,15 +321,9 @@ class NotebookPredictor(PromptedPredictor):
         replies.append(reply)
 
         # The whole answer is read before anything of the episode is changed.
-        text = parse_gemini(reply).lower()
+        subgoal = self._named(episode, replies)
         entries = read_notes(json_object(reply).get("notes", []))
         notebook = episode.notebook.with_entries(entries, finished)
-        together = "\n".join(replies)
-        if says_done(text):
-            points = episode.subgoal.points
-            subgoal = Subgoal(finished, points, queried=True, reply=together)
-        else:
-            subgoal = self.accepted(pixels_of_pairs(text), together)
         episode.notebook = notebook
         episode.since = []
         episode.agreed = False

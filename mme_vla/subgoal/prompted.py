@@ -99,7 +99,9 @@ class ConversationEpisode(SubgoalEpisode):
 
 
 class PromptedPredictor(SubgoalPredictor):
-    """The base of predictors with a model behind an endpoint; a subclass implements `_ask`.
+    """The base of predictors with a model behind an endpoint; a subclass implements `_answer`.
+
+    No failure ends an episode: it keeps its last subgoal, and the problem is counted.
 
     Args:
         interval: steps between two questions.
@@ -129,15 +131,37 @@ class PromptedPredictor(SubgoalPredictor):
 
     def _ask(self, episode: Any) -> Subgoal:
         """Return the episode's subgoal, in a thread of its own."""
+        replies: list[str] = []
+        try:
+            return self._answer(episode, replies)
+        except ApiFailure as failure:
+            problem, reason = failure.problem, str(failure)
+        except MalformedReply as error:
+            problem, reason = "malformed", str(error)
+        with self._lock:
+            return self.unchanged(episode, problem, "\n".join(replies), reason)
+
+    def _answer(self, episode: Any, replies: list[str]) -> Subgoal:
+        """Return the subgoal that the model names; each of its answers is added to `replies`."""
         raise NotImplementedError
+
+    def _named(self, episode: SubgoalEpisode, replies: list[str]) -> Subgoal:
+        """Return the subgoal that the last of these names, the episode's own if it is complete."""
+        text = parse_gemini(replies[-1]).lower()
+        together = "\n".join(replies)
+        if says_done(text):
+            last = episode.subgoal
+            return Subgoal(last.text, last.points, queried=True, reply=together)
+        parsed = pixels_of_pairs(text)
+        return Subgoal(parsed.text, parsed.points, queried=True, reply=together)
 
 
 @SUBGOALS.register("openai")
 class OpenAI(PromptedPredictor):
     """Asks at the first step and at multiples of `interval`, showing all frames since.
 
-    No failure ends an episode: it keeps its last subgoal, the problem is counted, and the frames
-    the model has not seen go with the next question. Videos are shown as images.
+    After a failure the frames the model has not seen go with the next question. Videos are shown
+    as images.
 
     Args:
         interval: steps between two questions.
@@ -171,27 +195,16 @@ class OpenAI(PromptedPredictor):
             return False
         return super().due(episode)
 
-    def _ask(self, episode: ConversationEpisode) -> Subgoal:
+    def _answer(self, episode: ConversationEpisode, replies: list[str]) -> Subgoal:
         message = episode.next_message()
         system = system_prompt(episode.task, self.kind)
-        try:
-            reply = self.api.ask(system, [*episode.messages, message]).text
-        except ApiFailure as failure:
-            episode.again = True
-            with self._lock:
-                return self.unchanged(episode, failure.problem, reason=str(failure))
+        episode.again = True
+        reply = self.api.ask(system, [*episode.messages, message]).text
         episode.again = False
+        replies.append(reply)
         episode.messages += [message, ("model", [reply])]
         episode.unseen = []
-        try:
-            text = parse_gemini(reply).lower()
-            if says_done(text):
-                last = episode.subgoal
-                return Subgoal(last.text, last.points, queried=True, reply=reply)
-            return self.accepted(pixels_of_pairs(text), reply)
-        except MalformedReply as error:
-            with self._lock:
-                return self.unchanged(episode, "malformed", reply, str(error))
+        return self._named(episode, replies)
 
 
 @SUBGOALS.register("gemini")

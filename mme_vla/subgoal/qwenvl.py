@@ -59,7 +59,11 @@ class VLMPredictor(SubgoalPredictor):
         raise NotImplementedError
 
     def read(self, episode: Any, reply: str) -> Subgoal:
-        """Return the subgoal of a reply, and update the episode."""
+        """Return the subgoal of a reply, and update the episode.
+
+        Raises:
+            MalformedReply: the reply cannot be used. The episode is as it was.
+        """
         raise NotImplementedError
 
     def predict_due(self, episodes: Sequence[Any]) -> list[Subgoal]:
@@ -72,7 +76,12 @@ class VLMPredictor(SubgoalPredictor):
             self.usage.calls += 1
             self.usage.input_tokens += completion.input_tokens
             self.usage.output_tokens += completion.output_tokens
-            subgoals.append(self.read(episode, completion.text))
+            try:
+                subgoal = self.read(episode, completion.text)
+            except MalformedReply as error:
+                problem = "malformed" if completion.text.strip() else "empty"
+                subgoal = self.unchanged(episode, problem, completion.text, str(error))
+            subgoals.append(subgoal)
         return subgoals
 
 
@@ -116,9 +125,6 @@ class QwenVL(VLMPredictor):
         return Question(subgoal_system(self.kind), user, [episode.frame], clips)
 
     def read(self, episode: QwenEpisode, reply: str) -> Subgoal:
-        try:
-            parsed = parse_subgoal(reply)
-        except MalformedReply as error:
-            return self.unreadable(episode, reply, error)
+        parsed = parse_subgoal(reply)
         episode.history.add(parsed.entry, parsed.points)
-        return self.accepted(parsed, reply)
+        return Subgoal(parsed.text, parsed.points, queried=True, reply=reply)
