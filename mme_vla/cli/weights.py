@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError, counted, listed, require
@@ -130,22 +131,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_intermixed_args(
         trust_as_flag(sys.argv[1:] if arguments is None else arguments)
     )
-    from mme_vla.cli.errors import print_user_errors
-
     with print_user_errors():
-        convert(
-            args.source,
-            args.destination,
-            args.overrides,
-            to=args.to,
-            dtype=args.dtype,
-            config_dir=args.config_dir,
-            asset=args.asset,
-            revision=args.revision,
-            base=args.base,
-            dry_run=args.dry_run,
-            trust_plugins=args.trust_plugins,
-        )
+        convert(**vars(args))  # each argument has the name of a parameter
 
 
 def convert(

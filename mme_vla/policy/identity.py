@@ -39,10 +39,13 @@ def identify_policy(policy: "Policy", name: str | None, source: str | None) -> P
         name: of the model; None for the policy's own.
         source: where the weights are from; None for fresh ones.
     """
+    budget = None
+    if policy.memory is not None and policy.memory.budget != DEFAULT_BUDGET:
+        budget = policy.memory.budget
     return PolicyIdentity(
         model=name or str(PolicySections.of(policy.config).name or "policy"),
         checkpoint=checkpoint_label(source),
-        memory_budget=memory_budget(policy),
+        memory_budget=budget,
         composition=composition_digest(policy.config),
         training=identity_of(policy.config),
     )
@@ -55,10 +58,3 @@ def checkpoint_label(source: str | None) -> int | str:
     name = Path(source).name
     step = re.search(r"(?:^|[_-])(\d+)$", name)
     return int(step[1]) if step else name
-
-
-def memory_budget(policy: "Policy") -> int | None:
-    """Memory tokens; None where they are `DEFAULT_BUDGET`."""
-    if policy.memory is None or policy.memory.budget == DEFAULT_BUDGET:
-        return None
-    return policy.memory.budget

@@ -256,7 +256,8 @@ def save_settings(
     if self_check is None:
         (folder / SELF_CHECK).unlink(missing_ok=True)  # of the weights that lay here before
     else:
-        names.append(self_check.write(folder))
+        (folder / SELF_CHECK).write_bytes(self_check.to_bytes())
+        names.append(SELF_CHECK)
     (folder / CARD_FILE).write_text(
         model_card(policy, config, self_check is not None), encoding="utf-8"
     )

@@ -5,7 +5,6 @@ the policy predicted where it was trained. A user who loads the weights compares
 import json
 import warnings
 from collections.abc import Mapping
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -24,8 +23,6 @@ from mme_vla.types import stack_noise
 from mme_vla.utils import Sums, checked_file, parse_json
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from mme_vla.policy.base import Policy
 
 FILE = "self_check.safetensors"
@@ -105,11 +102,6 @@ class SelfCheck:
     chunk: np.ndarray
     actions: np.ndarray
     about: About
-
-    def write(self, folder: Path) -> str:
-        """Write the file into a checkpoint and return its name."""
-        (folder / FILE).write_bytes(self.to_bytes())
-        return FILE
 
     def to_bytes(self) -> bytes:
         """The content of the file."""
@@ -259,6 +251,8 @@ def read_self_check(folder: Path) -> SelfCheck | None:
     Raises:
         UserError: the file is damaged, too large, or was removed from a checkpoint that lists it.
     """
+    from safetensors import safe_open
+
     if not (folder / FILE).exists():
         require(
             FILE not in Sums(folder).table,
@@ -274,7 +268,11 @@ def read_self_check(folder: Path) -> SelfCheck | None:
     )
     tensors = read_safetensors(path)
     check_values(tensors, str(path))
-    about = _read_about(path)
+    with safe_open(path, "pt") as opened:
+        text = (opened.metadata() or {}).get(_ABOUT)
+    if text is None:
+        raise UserError(f"{path} is no self-check: it has no description.")
+    about = read_section(About, parse_json(text, f"The description of {path}"), str(path))
     missing = [name for name in _REQUIRED if name not in tensors]
     require(not missing, f"{path} is no self-check: it lacks {listed(missing)}.")
     for name, tensor in tensors.items():
@@ -380,43 +378,36 @@ def predict_chunk(
         stored: return the actions that the stored chunk becomes.
     """
     devices = [policy.device] if policy.device.type == "cuda" else []
-    with torch.random.fork_rng(devices=devices), _inference(policy):
-        torch.manual_seed(_SEED)  # of what is sampled beside the noise
-        episode = policy.start_episode(check.about.goal, _SEED)
-        if policy.require_processor().prompt_spec.reads_subgoal:
-            episode.subgoal = check.about.goal
-        episode.options = tuple(
-            Option(chr(ord("a") + number), text, needs_point=True)
-            for number, text in enumerate(check.about.options)
-        )
-        past_actions = None
-        if policy.embodiment.action.frames is not None:
-            past_actions = check.past_actions
-        episode.observe(check.views, check.states, check.is_demo, past_actions)
-        batch = policy.observation([episode])
-        noise = stack_noise([check.noise])
-        chunk = policy.predict_chunk(batch, [episode], noise)[:1].float().cpu()
-        becomes_actions = chunk
-        if stored and chunk[0].shape == check.chunk.shape:
-            becomes_actions = torch.from_numpy(check.chunk)[None]
-        actions = executable_actions(policy, becomes_actions, [episode])[0].astype(np.float32)
-    return chunk[0].numpy(), actions
-
-
-@contextmanager
-def _inference(policy: "Policy") -> "Iterator[None]":
-    """Inside, the policy samples as it is evaluated, and computes in float32 where its weights are
-    float32.
-    """
     was_training, dtype = policy.training, policy.compute_dtype
+    # The policy samples as it is evaluated, and computes in float32 where its weights are float32.
     policy.eval()
     if _precision_of(policy) == "float32":
         policy.compute_dtype = torch.float32
     try:
-        yield
+        with torch.random.fork_rng(devices=devices):
+            torch.manual_seed(_SEED)  # of what is sampled beside the noise
+            episode = policy.start_episode(check.about.goal, _SEED)
+            if policy.require_processor().prompt_spec.reads_subgoal:
+                episode.subgoal = check.about.goal
+            episode.options = tuple(
+                Option(chr(ord("a") + number), text, needs_point=True)
+                for number, text in enumerate(check.about.options)
+            )
+            past_actions = None
+            if policy.embodiment.action.frames is not None:
+                past_actions = check.past_actions
+            episode.observe(check.views, check.states, check.is_demo, past_actions)
+            batch = policy.observation([episode])
+            noise = stack_noise([check.noise])
+            chunk = policy.predict_chunk(batch, [episode], noise)[:1].float().cpu()
+            becomes_actions = chunk
+            if stored and chunk[0].shape == check.chunk.shape:
+                becomes_actions = torch.from_numpy(check.chunk)[None]
+            actions = executable_actions(policy, becomes_actions, [episode])[0].astype(np.float32)
     finally:
         policy.compute_dtype = dtype
         policy.train(was_training)
+    return chunk[0].numpy(), actions
 
 
 def _reason(error: Exception) -> str:
@@ -434,16 +425,6 @@ def _precision_of(policy: "Policy") -> Literal["float32", "bfloat16"]:
 
 def _layout(noise: Mapping[str, Tensor]) -> dict[str, tuple[torch.Size, torch.dtype]]:
     return {name: (tensor.shape, tensor.dtype) for name, tensor in noise.items()}
-
-
-def _read_about(path: Path) -> About:
-    from safetensors import safe_open
-
-    with safe_open(path, "pt") as opened:
-        text = (opened.metadata() or {}).get(_ABOUT)
-    require(text is not None, f"{path} is no self-check: it has no description.")
-    assert text is not None
-    return read_section(About, parse_json(text, f"The description of {path}"), str(path))
 
 
 def _synthetic_views(robot: Embodiment) -> dict[str, np.ndarray]:

@@ -210,9 +210,14 @@ def _match_foreign(
 
     def split(tensors: Mapping[str, Tensor]) -> tuple[Adapter, dict[str, Tensor], list[str]]:
         """The part of the name table that these tensors can fill, those of it, and what is left
-        behind.
+        behind. The memory's parameters that the checkpoint does not hold are no part of it.
         """
-        reduced = _reduced(adapter, local, tensors)
+        table = {}
+        for name, pieces in adapter.table.items():
+            is_present = all(piece.path in tensors for piece in pieces)
+            if is_present or name not in local:
+                table[name] = pieces
+        reduced = replace(adapter, table=table)
         if adapter.of_memory is None:
             return reduced, dict(tensors), []
         known = {constant.path for constant in adapter.derived} | set(reduced.shapes(state))
@@ -232,16 +237,6 @@ def _match_foreign(
     tensors = checkpoint.tensors(check_names)
     reduced, named, left = split(tensors)
     return reduced.translate(named, state, source), left
-
-
-def _reduced(adapter: Adapter, local: set[str], source_tensors: Mapping[str, Tensor]) -> Adapter:
-    """Leave out the memory's parameters that the checkpoint does not hold."""
-    table = {}
-    for name, pieces in adapter.table.items():
-        is_present = all(piece.path in source_tensors for piece in pieces)
-        if is_present or name not in local:
-            table[name] = pieces
-    return replace(adapter, table=table)
 
 
 def _groups(names: list[str]) -> str:

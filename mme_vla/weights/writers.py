@@ -123,26 +123,21 @@ def check_target(policy: Policy, fmt: str) -> None:
             " parameters."
         )
     if fmt == "lerobot":
-        _check_names(policy.embodiment.action)
+        # LeRobot searches each absolute number's name in all names.
+        action = policy.embodiment.action
+        searched = [name.lower() for name in _absolute(action) if name]
+        for i, name in enumerate(action.names):
+            is_absolute = any(text in name.lower() for text in searched)
+            require(
+                not action.relative or is_absolute == (i not in action.relative),
+                f"LeRobot tells absolute actions by parts of names ({listed(searched)}), and would"
+                f" mistake number {i}, {name!r}: choose embodiment.action.names in which no"
+                " absolute number's name is part of a relative one's.",
+            )
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
     if fmt in method_formats():
         method_formats()[fmt].function("adapter")(policy)
-
-
-def _check_names(action: ActionSpace) -> None:
-    """Refuse names by which LeRobot, which searches each of the absolute numbers' in all names,
-    takes other numbers for absolute.
-    """
-    searched = [name.lower() for name in _absolute(action) if name]
-    for i, name in enumerate(action.names):
-        is_absolute = any(text in name.lower() for text in searched)
-        require(
-            not action.relative or is_absolute == (i not in action.relative),
-            f"LeRobot tells absolute actions by parts of names ({listed(searched)}), and would"
-            f" mistake number {i}, {name!r}: choose embodiment.action.names in which no absolute"
-            " number's name is part of a relative one's.",
-        )
 
 
 def _absolute(action: ActionSpace) -> list[str]:

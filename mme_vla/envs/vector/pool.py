@@ -155,7 +155,6 @@ class VecEnv:
         self.timeout = timeout
         self._factory = factory
         self._context = simulating_processes()
-        self._closed = False
         self._workers: list[_Worker] = []
         try:
             for _ in range(workers):
@@ -197,7 +196,7 @@ class VecEnv:
         state.resetting = True
         arguments = {"task": job.task, "split": job.split, "episode": job.episode}
         options = {} if images is None else {"images": images}
-        self._command(worker, protocol.RESET, arguments, options)
+        self._command(state, protocol.RESET, arguments, options)
 
     def send(self, worker: int, action: Any) -> None:
         """Let a worker perform an action; returns at once."""
@@ -207,7 +206,7 @@ class VecEnv:
             f"Worker {worker} runs no episode; call start() or start_next() first.",
         )
         state.resetting = False
-        self._command(worker, protocol.STEP, action)
+        self._command(state, protocol.STEP, action)
 
     def recv(self, timeout: float | None = None) -> list[Reply]:
         """Wait until at least one worker is ready, and take the replies of all that are.
@@ -242,7 +241,6 @@ class VecEnv:
 
     def close(self) -> None:
         """Stop all workers; closing twice is harmless."""
-        self._closed = True
         for state in self._workers:
             try:
                 protocol.send(state.connection, protocol.CLOSE)
@@ -281,8 +279,7 @@ class VecEnv:
         require(not state.running, message)
         return state
 
-    def _command(self, worker: int, *message: Any) -> None:
-        state = self._workers[worker]
+    def _command(self, state: _Worker, *message: Any) -> None:
         state.running = True
         state.deadline = time.monotonic() + self.timeout
         if state.resetting:
@@ -323,7 +320,7 @@ class VecEnv:
         return Reply.of_failure(index, old.current_job, old.resetting, error)
 
     def _require_open(self) -> None:
-        require(not self._closed, "The environments are closed; make new ones.")
+        require(self._workers, "The environments are closed; make new ones.")
 
 
 def serve(inherited: Any, connection: Any, factory: Callable[..., Any]) -> None:

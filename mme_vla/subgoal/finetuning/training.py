@@ -10,7 +10,7 @@ predicts with it.
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, counted, missing_extra, require
@@ -108,7 +108,7 @@ def fine_tune(cfg: "DictConfig") -> Path:
     """Train as configs/subgoal_train.yaml and the command line say; return the adapter's folder."""
     try:
         from peft import LoraConfig, get_peft_model
-        from transformers import Trainer, set_seed
+        from transformers import Trainer, TrainingArguments, set_seed
     except ImportError:
         raise missing_extra("Fine-tuning Qwen3-VL", "vlm") from None
 
@@ -135,12 +135,39 @@ def fine_tune(cfg: "DictConfig") -> Path:
         target_modules=TARGETS,
         task_type="CAUSAL_LM",
     )
+    processes = int(os.environ.get("WORLD_SIZE", "1"))
     try:
         vlm = VLM(get_peft_model(model, lora), processor)
         vlm.model.config.use_cache = False
+        arguments = TrainingArguments(
+            output_dir=str(output),
+            per_device_train_batch_size=cfg.per_device_batch,
+            gradient_accumulation_steps=accumulation(cfg.batch, cfg.per_device_batch, processes),
+            num_train_epochs=cfg.epochs,
+            max_steps=-1 if cfg.steps is None else cfg.steps,
+            learning_rate=cfg.lr,
+            lr_scheduler_type="cosine",
+            warmup_steps=cfg.warmup,  # below 1 it is a share of all steps
+            weight_decay=cfg.weight_decay,
+            adam_beta2=0.95,
+            max_grad_norm=1.0,
+            bf16=device != "cpu",
+            use_cpu=device == "cpu",
+            gradient_checkpointing=cfg.gradient_checkpointing,
+            gradient_checkpointing_kwargs={"use_reentrant": False},
+            dataloader_num_workers=cfg.workers,
+            remove_unused_columns=False,
+            seed=cfg.seed,
+            data_seed=cfg.seed,
+            logging_steps=cfg.log_every,
+            save_steps=cfg.save_every,
+            save_total_limit=cfg.keep,
+            report_to=[] if cfg.report_to is None else [cfg.report_to],
+            deepspeed=ZERO2 if cfg.deepspeed == "zero2" else cfg.deepspeed,
+        )
         trainer = Trainer(
             model=vlm.model,
-            args=_arguments(cfg, output, device),
+            args=arguments,
             train_dataset=rows,
             data_collator=Collator(vlm),
         )
@@ -155,36 +182,3 @@ def fine_tune(cfg: "DictConfig") -> Path:
             f" subgoal.adapter={output / ADAPTER} predicts with it."
         )
     return output / ADAPTER
-
-
-def _arguments(cfg: "DictConfig", output: Path, device: str) -> Any:
-    from transformers import TrainingArguments
-
-    processes = int(os.environ.get("WORLD_SIZE", "1"))
-    deepspeed = ZERO2 if cfg.deepspeed == "zero2" else cfg.deepspeed
-    return TrainingArguments(
-        output_dir=str(output),
-        per_device_train_batch_size=cfg.per_device_batch,
-        gradient_accumulation_steps=accumulation(cfg.batch, cfg.per_device_batch, processes),
-        num_train_epochs=cfg.epochs,
-        max_steps=-1 if cfg.steps is None else cfg.steps,
-        learning_rate=cfg.lr,
-        lr_scheduler_type="cosine",
-        warmup_steps=cfg.warmup,  # below 1 it is a share of all steps
-        weight_decay=cfg.weight_decay,
-        adam_beta2=0.95,
-        max_grad_norm=1.0,
-        bf16=device != "cpu",
-        use_cpu=device == "cpu",
-        gradient_checkpointing=cfg.gradient_checkpointing,
-        gradient_checkpointing_kwargs={"use_reentrant": False},
-        dataloader_num_workers=cfg.workers,
-        remove_unused_columns=False,
-        seed=cfg.seed,
-        data_seed=cfg.seed,
-        logging_steps=cfg.log_every,
-        save_steps=cfg.save_every,
-        save_total_limit=cfg.keep,
-        report_to=[] if cfg.report_to is None else [cfg.report_to],
-        deepspeed=deepspeed,
-    )
