@@ -79,23 +79,20 @@ DEFAULT_MODEL = "tokendrop_expert"
 """The model of configs/policy.yaml."""
 
 
-def name_composition(cfg: DictConfig, overrides: Iterable[str]) -> DictConfig:
-    """A configuration whose memory or integration the command line chose without a model has a name
-    of its own, such as `rmt_modulator`: the default model is another one.
-
-    Changed in place, and returned.
+def name_composition(cfg: DictConfig, overrides: Iterable[str]) -> None:
+    """Give a configuration whose memory or integration the command line chose without a model a
+    name of its own, such as `rmt_modulator`: the default model is another one.
     """
     keys = {word.lstrip("+").partition("=")[0] for word in overrides}
     has_parts = bool(keys & {"memory", "memory.name", "integration", "integration.name"})
     if not has_parts or keys & {"model", "name"} or "name" not in cfg or cfg.name != DEFAULT_MODEL:
-        return cfg
+        return
     memory = cfg.memory or {}
     names = []
     for member in memory.get("members") or [memory]:
         names.append(member.get("name") if isinstance(member, Mapping) else member)
     parts = ["+".join(filter(None, names)), (cfg.integration or {}).get("name")]
     cfg.name = "_".join(filter(None, parts)) or "memoryless"
-    return cfg
 
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")

@@ -30,7 +30,7 @@ class StorageSpec:
     """What is stored of each frame for a memory. It is data, so that a cache can be named after it.
 
     grid: side of the pooled token grid: a view's tokens are pooled to grid×grid before they are
-        stored. It divides the backbone's (`check_grid`).
+        stored. It divides the backbone's (`build_memory`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
         Options of memories call this interval `every` or `stride`, keys of a cache `every`.

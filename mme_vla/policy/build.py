@@ -36,22 +36,15 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
         width: of the memory's own tokens.
     """
     memory: MemoryModule = MEMORIES.build(section, d_vision=d_vision, width=width)
-    check_grid(memory, grid)
+    # A view's tokens must pool to the grid that the memory stores.
+    sides = [side for side in range(1, grid + 1) if grid % side == 0]
+    require(
+        memory.storage.grid in sides,
+        f"memory.grid={memory.storage.grid}: the backbone's {grid}×{grid} tokens a view pool to"
+        f" {', '.join(map(str, sides))} a side.",
+    )
     check_scorer(memory)
     return memory
-
-
-def check_grid(memory: MemoryModule, views: int) -> None:
-    """Raise an error unless views of views×views tokens can be pooled to the grid that the memory
-    stores.
-    """
-    if views % memory.storage.grid == 0:
-        return
-    sides = [str(side) for side in range(1, views + 1) if views % side == 0]
-    raise UserError(
-        f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool to"
-        f" {', '.join(sides)} a side."
-    )
 
 
 def check_integrated(
@@ -203,30 +196,22 @@ def build_from_config(
 
 
 def policy_config(cfg: DictConfig) -> dict[str, Any]:
-    """A command's configuration as plain values, with the embodiment of its environment.
+    """A command's configuration as plain values, with the embodiment of its `env`, unless another
+    than the default is selected.
 
     Plugins are imported first: one of them may register the environment.
     """
     import_plugins(plugins_of(cfg, "the configuration"))
-    values = OmegaConf.to_container(with_embodiment(cfg), resolve=True)
+    env = cfg.get("env")
+    robot = cfg.get("embodiment")
+    if env is not None and robot is not None and robot.name == ROBOMME_JOINT.name:
+        section = ENVS[env].embodiment
+        if section is not None:
+            cfg = copy.deepcopy(cfg)
+            OmegaConf.set_struct(cfg, False)
+            cfg.embodiment = Embodiment.from_dict(section).to_dict()
+    values = OmegaConf.to_container(cfg, resolve=True)
     return cast("dict[str, Any]", values)
-
-
-def with_embodiment(config: DictConfig) -> DictConfig:
-    """The configuration with the embodiment of `env`, unless another than the default
-    is selected.
-    """
-    name = config.get("env")
-    robot = config.get("embodiment")
-    if name is None or robot is None or robot.name != ROBOMME_JOINT.name:
-        return config
-    section = ENVS[name].embodiment
-    if section is None:
-        return config
-    config = copy.deepcopy(config)
-    OmegaConf.set_struct(config, False)
-    config.embodiment = Embodiment.from_dict(section).to_dict()
-    return config
 
 
 def build_processor(config: Mapping[str, Any]) -> PolicyProcessor:

@@ -78,19 +78,6 @@ def policy_class(config: Mapping[str, Any]) -> type[Any]:
     return kind
 
 
-def policy_class_for[P](requested: type[P], config: Mapping[str, Any], source: str) -> type[P]:
-    """The class to load a checkpoint with, where `requested.from_pretrained` was called."""
-    kind = policy_class(config)
-    if issubclass(requested, kind):
-        return requested
-    if issubclass(kind, requested):
-        return kind
-    raise UserError(
-        f"{source} holds a {policy_name(config)!r} policy, which is no {requested.__name__}: load"
-        " it with Policy.from_pretrained(), which knows every kind."
-    )
-
-
 def policy_options(cls: type, config: Mapping[str, Any]) -> dict[str, Any]:
     """The section `policy`, whose keys beside `name` are the constructor's keyword-only arguments.
 
@@ -307,7 +294,15 @@ def load_policy[P: "Policy"](
         check_known(f"section in {folder / CONFIG}:", key, KNOWN_SECTIONS)
     PolicySections.of(config, str(folder / CONFIG))  # refuses a section that is none
     import_trusted(config, str(source), trust_plugins)
-    policy_type = policy_class_for(requested, config, str(source))
+    policy_type = requested
+    described = policy_class(config)
+    if not issubclass(requested, described):
+        require(
+            issubclass(described, requested),
+            f"{source} holds a {policy_name(config)!r} policy, which is no {requested.__name__}:"
+            " load it with Policy.from_pretrained(), which knows every kind.",
+        )
+        policy_type = described
 
     # Precision: `auto` rounds on a GPU, if the policy is made for it.
     kind = requested_dtype or torch.float32

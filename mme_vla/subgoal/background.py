@@ -18,6 +18,7 @@ class BackgroundEpisode(SubgoalEpisode):
 
     inner: the episode of the predictor, which may be busy with it. Frames are passed on later.
     subgoal: the last answer; `queried` until `predict` has returned it.
+    delayed: the frames that `inner` has not been given yet, as calls.
     answered: whether there was an answer yet.
     """
 
@@ -25,21 +26,15 @@ class BackgroundEpisode(SubgoalEpisode):
         super().__init__(inner.goal, inner.video, inner.task)
         self.inner = inner
         self.answered = False
-        self._delayed: list[Callable[[], None]] = []
+        self.delayed: list[Callable[[], None]] = []
 
     def skip(self, count: int) -> None:
         super().skip(count)
-        self._delayed.append(lambda: self.inner.skip(count))
+        self.delayed.append(lambda: self.inner.skip(count))
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
         super().observe(frames, info)
-        self._delayed.append(lambda: self.inner.observe(frames, info))
-
-    def catch_up(self) -> None:
-        """Pass the delayed frames on to `inner`; only while no model computes for this episode."""
-        for pass_on in self._delayed:
-            pass_on()
-        self._delayed.clear()
+        self.delayed.append(lambda: self.inner.observe(frames, info))
 
 
 class BackgroundPredictor(SubgoalPredictor):
@@ -61,8 +56,7 @@ class BackgroundPredictor(SubgoalPredictor):
         self.settings = inner.settings
         self.sees_video = inner.sees_video
         self.sees_passing = inner.sees_passing
-        self._queried_episodes: list[BackgroundEpisode] = []
-        self._prediction: Future[list[Subgoal]] | None = None
+        self._prediction: Future[list[tuple[BackgroundEpisode, Subgoal]]] | None = None
 
     def start_episode(
         self, goal: str, video: np.ndarray | None = None, task: str = ""
@@ -101,24 +95,23 @@ class BackgroundPredictor(SubgoalPredictor):
             has_news = episode.inner.n_observed_frames < episode.n_observed_frames
             if episode.answered and not has_news:
                 continue  # answered just now, for the current frame
-            episode.catch_up()
+            # No model computes for this episode: its predictor catches up.
+            for pass_on in episode.delayed:
+                pass_on()
+            episode.delayed.clear()
             if not episode.answered or self.inner.due(episode.inner):
                 due.append(episode)
         if due:
-            self._queried_episodes = due
             inner = [episode.inner for episode in due]
-            self._prediction = start(lambda: self.inner.predict(inner))
+            self._prediction = start(lambda: list(zip(due, self.inner.predict(inner), strict=True)))
 
     def _collect(self, wait: bool = False) -> None:
         """Take the subgoals of the prediction under way, if it has ended."""
-        if self._prediction is None:
-            return
-        if not wait and not self._prediction.done():
-            return
         prediction = self._prediction
+        if prediction is None or not (wait or prediction.done()):
+            return
         self._prediction = None  # an error is raised once: the next question may be answered
-        for episode, subgoal in zip(self._queried_episodes, prediction.result(), strict=True):
+        for episode, subgoal in prediction.result():
             episode.subgoal = subgoal
             episode.query_step = episode.inner.query_step
             episode.answered = True
-        self._queried_episodes = []
