@@ -3,7 +3,7 @@
 import glob
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from mme_vla.envs.robomme.recording.outputs import EpisodeWriter, Job, Recording
 from mme_vla.envs.robomme.recording.own import DRAFT, episode_file, record_own
 from mme_vla.envs.robomme.recording.processes import carry_out, simulation_pool
 from mme_vla.envs.rows import task_options
-from mme_vla.errors import UserError, counted, require
+from mme_vla.errors import SceneError, UserError, counted, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, is_vacant, read_json, write_json
 from mme_vla.utils.processes import signals_deferred
 
@@ -79,7 +79,6 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> None
     that succeeded, steps, stored steps, video steps, the failed seeds with reasons, and the facts.
     """
     from mme_vla.envs.robomme.recording.recorder import Recorder
-    from mme_vla.envs.robomme.scene.placement import SceneError
 
     failures: dict[int, str] = {}
     draft = folder / f"{job.name}.writing"
@@ -95,7 +94,8 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> None
         try:
             request = None
             if job.frames is not None:
-                blind = _unseen(job.task, scene)
+                with closing(make_task(job.task, render=False, **scene)) as task:
+                    blind = Recorder(task, render=False).record()
                 if not blind.success:
                     failures[seed] = blind.error or FAILED
                     continue
@@ -139,17 +139,6 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> None
         f"{job.task} episode {job.episode}: none of the seeds {job.seed} … {last[0]} succeeded; the"
         f" last: {last[1]}. Raise retries, or leave this episode out."
     )
-
-
-def _unseen(task: str, scene: dict[str, Any]) -> "Recording":
-    """The same demonstration without images, its steps in memory."""
-    from mme_vla.envs.robomme.recording.recorder import Recorder
-
-    env = make_task(task, render=False, **scene)
-    try:
-        return Recorder(env, render=False).record()
-    finally:
-        env.close()
 
 
 def record(

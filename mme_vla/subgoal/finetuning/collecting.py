@@ -10,7 +10,7 @@ always gives the same files.
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -114,7 +114,6 @@ def build(
             " another output, repeat that command to finish it, or remove the folder yourself.",
         )
         # An interrupted run may have left unfinished files.
-        remove_drafts(output)
         for path in output.rglob("*"):
             if path.is_dir():
                 remove_drafts(path)
@@ -187,20 +186,14 @@ def _part(output: Path, name: str, episode: Demonstration) -> Path:
 def _h5_labels(ref: EpisodeRef) -> Labels:
     with open_episode(ref) as episode:
         joints, targets = episode.joints()
-        simple = []
-        grounded = []
-        for texts in episode.subgoals():
-            simple.append(texts["simple_subgoal"])
-            grounded.append(texts["grounded_subgoal"])
         return Labels(
             task=ref.task,
             number=ref.index,
             goal=episode.goals[0],
             exec_start=episode.exec_start,
-            simple=simple,
-            grounded=grounded,
             joints=joints,
             targets=targets,
+            **_texts(episode.subgoals()),
         )
 
 
@@ -250,22 +243,25 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
 
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
-    simple = []
-    grounded = []
-    for t in range(int(source.lengths[episode])):
-        texts = source.subgoals(episode, t)
-        simple.append(texts["simple_subgoal"])
-        grounded.append(texts["grounded_subgoal"])
+    subgoals = (source.subgoals(episode, t) for t in range(int(source.lengths[episode])))
     return Labels(
         task=task,
         number=number,
         goal=source.goal(episode),
         exec_start=int(source.exec_starts[episode]),
-        simple=simple,
-        grounded=grounded,
         joints=source.states(episode)[:, :ARM_JOINTS],
         targets=source.actions(episode)[:, :ARM_JOINTS],
+        **_texts(subgoals),
     )
+
+
+def _texts(subgoals: Iterable[Mapping[str, str]]) -> dict[str, list[str]]:
+    """The subgoals of each kind, frame by frame."""
+    texts: dict[str, list[str]] = {"simple": [], "grounded": []}
+    for subgoal in subgoals:
+        for kind, so_far in texts.items():
+            so_far.append(subgoal[f"{kind}_subgoal"])
+    return texts
 
 
 def _lerobot_images(
