@@ -104,12 +104,11 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> None
         except SceneError as error:
             failures[seed] = str(error)
             continue
-        writer = EpisodeWriter(draft, job.episode, task, job.frames)
-        try:
+        with (
+            closing(task),
+            closing(EpisodeWriter(draft, job.episode, task, job.frames)) as writer,
+        ):
             result: Recording = Recorder(task, on_step=writer.add, render_request=request).record()
-        finally:
-            writer.close()
-            task.close()
         if blind is not None and (blind.steps, blind.stored) != (result.steps, result.stored):
             raise RuntimeError(
                 f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when"

@@ -12,6 +12,7 @@ which become the conditioning video), `frozen` (on reset: steps in which no acti
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import closing
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import count
@@ -193,12 +194,9 @@ class Environment(ABC):
         """
         if type(self).scene_values is Environment.scene_values:
             return NO_VALUES
-        env = self.open(spec.task, spec.split, spec.episode, render=False)
-        try:
+        with closing(self.open(spec.task, spec.split, spec.episode, render=False)) as env:
             env.reset()
             digest: str = env.scene_digest
-        finally:
-            env.close()
         return digest
 
     def step_limit(self, split: str) -> int:

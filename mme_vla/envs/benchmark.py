@@ -1,7 +1,7 @@
 """RoboMME as the entry `mme_vla` of the registry of environments."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 from mme_vla.embodiment import Embodiment
@@ -107,9 +107,6 @@ def _scene_of(spec: EpisodeSpec) -> Iterator[Any]:
     Raises:
         SceneError: it cannot be built.
     """
-    task = make.make_task(spec.task, render=False, **spec.options)
-    try:
+    with closing(make.make_task(spec.task, render=False, **spec.options)) as task:
         task.reset()
         yield task
-    finally:
-        task.close()

@@ -2,6 +2,7 @@
 complete?
 """
 
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -54,8 +55,7 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
 
 def check_standing(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> None:
     """A robot that stands still for a step more than there are sub-tasks does not succeed."""
-    env = make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
-    try:
+    with closing(make_task(task, render=False, seed=seed, difficulty=difficulty, **options)) as env:
         env.reset()
         script = env.unwrapped
         for _ in range(len(script.progress.subtasks) + 1):
@@ -64,8 +64,6 @@ def check_standing(task: str, seed: int, difficulty: str | None, options: dict[s
             "the episode is a success though the robot stands still: `done` of a sub-task must"
             " follow from what the robot does."
         )
-    finally:
-        env.close()
 
 
 def check_seeds(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> None:
@@ -90,7 +88,7 @@ def _scene(
         env = make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
     except SceneError:  # of this seed objects find no place
         return {"the places of objects": []}
-    try:
+    with closing(env):
         env.reset()
         script = env.unwrapped
         subtasks = []
@@ -103,8 +101,6 @@ def _scene(
             "subtasks()": subtasks,
             "choices()": [(choice.label, choice.action) for choice in script.choices()],
         }
-    finally:
-        env.close()
 
 
 def check_choices(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> None:
@@ -112,8 +108,7 @@ def check_choices(task: str, seed: int, difficulty: str | None, options: dict[st
     from mme_vla.envs.robomme.robot.control import PlanningError
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
-    env = make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
-    try:
+    with closing(make_task(task, render=False, seed=seed, difficulty=difficulty, **options)) as env:
         env.reset()
         script = env.unwrapped
         choices = list(script.choices())
@@ -141,8 +136,6 @@ def check_choices(task: str, seed: int, difficulty: str | None, options: dict[st
                     f"option {choice.label!r} of choices() ({choice.action}) raises"
                     f" {type(error).__name__}: {error}"
                 ) from error
-    finally:
-        env.close()
 
 
 def _demonstrated(
@@ -151,8 +144,7 @@ def _demonstrated(
     from mme_vla.envs.robomme.recording.recorder import demonstrate
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
-    env = make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
-    try:
+    with closing(make_task(task, render=False, seed=seed, difficulty=difficulty, **options)) as env:
         env.reset()
         track: list[np.ndarray] = []
         script = env.unwrapped
@@ -164,5 +156,3 @@ def _demonstrated(
             "success": bool(done),
             "qpos": np.array(track),
         }
-    finally:
-        env.close()

@@ -242,11 +242,9 @@ class VecEnv:
     def close(self) -> None:
         """Stop all workers; closing twice is harmless."""
         for state in self._workers:
-            try:
+            with suppress(OSError):  # it may be gone already
                 protocol.send(state.connection, protocol.CLOSE)
                 state.connection.close()  # ends the sending of a reply that was not taken
-            except OSError:
-                pass  # it is gone already
         until = time.monotonic() + _CLOSING_SECONDS
         for state in self._workers:
             state.process.join(max(0.0, until - time.monotonic()))

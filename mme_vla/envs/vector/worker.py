@@ -11,6 +11,7 @@ import pickle
 import sysconfig
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -78,11 +79,9 @@ def portable(error: Exception) -> Exception:
             place = f"{frame.f_code.co_filename}, line {line}"
     portable: Exception = RuntimeError(f"{type(error).__name__}: {error}")
     if type(error).__module__ in ("builtins", errors.__name__):
-        try:
+        with suppress(Exception):  # its arguments may not survive the way
             pickle.loads(pickle.dumps(error))
             portable = error
-        except Exception:
-            pass  # its arguments do not survive the way
     if place is not None and not isinstance(error, errors.UserError | errors.SceneError):
         errors.set_place(portable, f"{type(error).__name__}, {place}")
     return portable

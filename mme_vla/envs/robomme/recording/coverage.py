@@ -3,6 +3,7 @@ never do.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,9 @@ def goal_of(spec: EpisodeSpec) -> str:
     """The goal of an episode as policies are told it; its scene is built for that,
     without images.
     """
-    env = make_task(spec.task, render=False, **spec.options)
-    try:
+    with closing(make_task(spec.task, render=False, **spec.options)) as env:
         goal: str = env.goals()[0].lower()
         return goal
-    finally:
-        env.close()
 
 
 def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, set[str]]:

@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -112,8 +113,7 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
     if environment.embodiment is not None:
         robot = Embodiment.from_dict(environment.embodiment)
         space = robot.action.space
-    env = environment.open(spec.task, spec.split, spec.episode, action_space=space)
-    try:
+    with closing(environment.open(spec.task, spec.split, spec.episode, action_space=space)) as env:
         options: list[dict[str, Any]] = []
         if robot is not None and space == CHOICES:
             columns, options, success = _by_choices(env, robot)
@@ -126,8 +126,6 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
         columns["facts"] = np.array(json.dumps([fact.to_dict() for fact in env.facts]))
         columns["options"] = np.array(json.dumps(options))
         return columns
-    finally:
-        env.close()
 
 
 def _by_motions(env: EpisodeEnv) -> dict[str, np.ndarray]:
