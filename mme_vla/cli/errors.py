@@ -8,7 +8,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
 
 from mme_vla.errors import ERROR, UserError, printable
 from mme_vla.utils.io import disk_trouble
@@ -40,16 +39,22 @@ def print_user_errors() -> Iterator[None]:
             poll.register(sys.stdout, 0)
             if not any(event & select.POLLERR for _, event in poll.poll(0)):
                 raise
-        except KeyboardInterrupt as stop:
-            _end_interrupted(stop)
-        except Exception as error:
-            # The signal that an exception hides: a `finally` that fails on half-made objects
-            # replaces it.
-            hidden: BaseException | None = error
-            while hidden is not None:
-                if isinstance(hidden, KeyboardInterrupt):
-                    _end_interrupted(hidden)
-                hidden = hidden.__context__
+        except (Exception, KeyboardInterrupt) as error:
+            # A signal, also one that an exception hides: a `finally` that fails on half-made
+            # objects replaces it.
+            stop: BaseException | None = error
+            while stop is not None:
+                if isinstance(stop, KeyboardInterrupt):
+                    name, number = "Ctrl-C", signal.SIGINT
+                    if isinstance(stop, Terminated):
+                        name, number = "SIGTERM", signal.SIGTERM
+                    _print(
+                        f"Stopped by {name}. What was finished is kept: the same command continues"
+                        " from there.",
+                        "Stopped",
+                    )
+                    raise SystemExit(128 + number) from None
+                stop = stop.__context__
             code = DISK_TROUBLE
             message = disk_trouble(error)
             if isinstance(error, UserError):
@@ -64,17 +69,6 @@ def print_user_errors() -> Iterator[None]:
                 sys.stdout.flush()
             except BrokenPipeError:  # what is still to be written has no reader
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _end_interrupted(stop: KeyboardInterrupt) -> NoReturn:
-    name, number = "Ctrl-C", signal.SIGINT
-    if isinstance(stop, Terminated):
-        name, number = "SIGTERM", signal.SIGTERM
-    _print(
-        f"Stopped by {name}. What was finished is kept: the same command continues from there.",
-        "Stopped",
-    )
-    raise SystemExit(128 + number) from None
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import shlex
 import time
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -224,7 +224,7 @@ def _train(
         remove_drafts(place.folder)
         with write_atomically(place.folder / CONFIG) as draft:
             OmegaConf.save(OmegaConf.create(config), draft)
-    try:
+    with closing(loggers):
         with line:
             finished = trainer.run(line, loggers)
             trainer.close()
@@ -234,8 +234,6 @@ def _train(
             folder = place.folder if run.trainings == 1 else place.folder.parent
             words = ["mme-vla", "train", *running_words("resume="), f"resume={folder}"]
             line.say(f"Continue by the same command with resume=:\n  {shlex.join(words)}")
-    finally:
-        loggers.close()
     return trainer
 
 

@@ -10,6 +10,7 @@
 """
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Literal, Self, get_args
@@ -382,7 +383,7 @@ def detect(choice: ServerChoice) -> tuple[str, str]:
     except TimeoutError:
         HarnessConnection(choice.server, **settings, open_timeout=connection.open_s).close()
         return "harness", "it waits for a greeting and returns one"
-    try:
+    with closing(client):
         if ServerMetadata.of(client.metadata).server == SERVER_NAME:
             return "mme_vla", "its metadata say so"
         try:
@@ -394,8 +395,6 @@ def detect(choice: ServerChoice) -> tuple[str, str]:
         if "reset_time_ms" in reply:
             return "robomme", "it times a reset, as the released server"
         return "challenge", "it knows a reset, and does not time it"
-    finally:
-        client.close()
 
 
 def _lists(robot: Embodiment, frames: NewFrames) -> dict[str, Any]:
