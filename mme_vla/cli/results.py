@@ -35,7 +35,15 @@ from mme_vla.evaluation.results.curves import (
 )
 from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.paper import demo_records
-from mme_vla.evaluation.results.report import conclude, mixed_settings, read_runs, training_details
+from mme_vla.evaluation.results.report import (
+    Section,
+    conclude,
+    html_page,
+    html_report,
+    mixed_settings,
+    read_runs,
+    training_details,
+)
 from mme_vla.evaluation.results.scopes import (
     PAPER_ORDER,
     TASK_FACTS,
@@ -318,8 +326,6 @@ def show_tables(
     """
     from rich.console import Console
 
-    from mme_vla.evaluation.results.report import Section, html_page
-
     texts: dict[Path, str] = {}
     notes: list[str] = []
     blocks: list[str] = []
@@ -372,8 +378,6 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
             notes=results.notes,
         )
     if args.html:
-        from mme_vla.evaluation.results.report import html_report
-
         texts[args.html] = html_report(results, comparisons, args.title)
     _write(texts)
     return list(texts)

@@ -21,9 +21,10 @@ from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError, counted, listed, require
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_from_config, build_processor
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
-from mme_vla.processing.base import STATS_FILE
+from mme_vla.processing.base import STATS_FILE, load_processor
 from mme_vla.weights.load import adapter_of, read_as
 from mme_vla.weights.source import Source, formats, method_formats, open_source
 from mme_vla.weights.statistics import read_stats
@@ -184,8 +185,6 @@ def convert(
         )
     tensors = read_as(policy, opened)
     if to == "ours" and policy.processor is None:
-        from mme_vla.policy.build import build_processor
-
         policy.processor = build_processor(policy.config)
     with torch.no_grad():
         assign_tensors(policy, tensors, str(source), torch.float32)
@@ -206,7 +205,6 @@ def _policy(
 ) -> Policy:
     """The policy a source belongs to, on meta, with its processor if that can be had."""
     from mme_vla.config.composition import compose
-    from mme_vla.processing.base import load_processor
 
     if opened.format == "ours":
         if overrides:
@@ -225,8 +223,6 @@ def _policy(
         policy.processor = load_processor(opened.folder)
         check_processor(policy, str(opened.folder))
         return policy
-    from mme_vla.policy.build import build_from_config
-
     # The model: the one that is named, else the one that the source is of.
     words = list(overrides)
     settings = {}

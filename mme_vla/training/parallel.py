@@ -19,7 +19,7 @@ from torch.distributed.checkpoint.state_dict import (
 )
 from torch.distributed.device_mesh import DeviceMesh
 from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
-from torch.distributed.tensor import DTensor
+from torch.distributed.tensor import DTensor, distribute_tensor
 
 from mme_vla.policy.base import Policy
 from mme_vla.policy.network import NetworkPolicy
@@ -137,7 +137,6 @@ def like(tensor: Tensor, full: Tensor) -> Tensor:
     """
     if not isinstance(tensor, DTensor) or isinstance(full, DTensor):
         return full
-    from torch.distributed.tensor import distribute_tensor
 
     local = full.to(tensor.to_local().device)
     return distribute_tensor(local, tensor.device_mesh, tensor.placements, src_data_rank=None)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
 from mme_vla.embodiment import ActionSpace
@@ -95,8 +96,6 @@ Step = tuple[str, dict[str, Any]]
 
 
 def _write(folder: Path, name: str, steps: list[Step], stats: NormStats) -> None:
-    from safetensors.torch import save_file
-
     tensors = {}
     for feature, values in (("observation.state", stats.state), ("action", stats.actions)):
         for key, value in values.to_dict().items():
@@ -250,8 +249,6 @@ def write_policy(
 
 def _write_safetensors(tensors: Mapping[str, Tensor], folder: Path, dtype: torch.dtype) -> None:
     """Write one file, as those libraries read it; a tensor under two names is written twice."""
-    from safetensors.torch import save_file
-
     storages: set[int] = set()
     apart = {}
     for name, tensor in tensors.items():
