@@ -275,23 +275,22 @@ def read_self_check(folder: Path) -> SelfCheck | None:
     about = read_section(About, parse_json(text, f"The description of {path}"), str(path))
     missing = [name for name in _REQUIRED if name not in tensors]
     require(not missing, f"{path} is no self-check: it lacks {listed(missing)}.")
+    views: dict[str, np.ndarray] = {}
+    noise: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         kinds = _KINDS.get(name.split("/")[0], ())
         require(
             (tensor.dtype, tensor.ndim) in kinds and tensor.numel(),
             f"{path} is no self-check: {name!r} is {tensor.dtype} {list(tensor.shape)}.",
         )
-    count = len(tensors[_STATES])
-    require(
-        count <= _FRAMES, f"{path} has {count:,} frames, more than the {_FRAMES} of a self-check."
-    )
-    views: dict[str, np.ndarray] = {}
-    noise: dict[str, Tensor] = {}
-    for name, tensor in tensors.items():
         if name.startswith(_VIEW):
             views[name.removeprefix(_VIEW)] = tensor.numpy()
         elif name.startswith(_NOISE):
             noise[name.removeprefix(_NOISE)] = tensor
+    count = len(tensors[_STATES])
+    require(
+        count <= _FRAMES, f"{path} has {count:,} frames, more than the {_FRAMES} of a self-check."
+    )
     return SelfCheck(
         views=views,
         states=tensors[_STATES].numpy(),
