@@ -259,7 +259,7 @@ class NotebookPredictor(PromptedPredictor):
     ) -> None:
         super().__init__(kind, interval, workers, api, client, settings)
 
-    def _answer(self, episode: NotebookEpisode, replies: list[str]) -> Subgoal:
+    def _predict_one(self, episode: NotebookEpisode, replies: list[str]) -> Subgoal:
         last = episode.subgoal
         if last.text is not None and not self._complete(episode, last.text, replies):
             return Subgoal(last.text, last.points, queried=True, reply=replies[0])

@@ -99,7 +99,7 @@ class ConversationEpisode(SubgoalEpisode):
 
 
 class PromptedPredictor(SubgoalPredictor):
-    """The base of predictors with a model behind an endpoint; a subclass implements `_answer`.
+    """The base of predictors with a model behind an endpoint; a subclass implements `_predict_one`.
 
     No failure ends an episode: it keeps its last subgoal, and the problem is counted.
 
@@ -133,7 +133,7 @@ class PromptedPredictor(SubgoalPredictor):
         """Return the episode's subgoal, in a thread of its own."""
         replies: list[str] = []
         try:
-            return self._answer(episode, replies)
+            return self._predict_one(episode, replies)
         except ApiFailure as failure:
             problem, reason = failure.problem, str(failure)
         except MalformedReply as error:
@@ -141,7 +141,7 @@ class PromptedPredictor(SubgoalPredictor):
         with self._lock:
             return self.unchanged(episode, problem, "\n".join(replies), reason)
 
-    def _answer(self, episode: Any, replies: list[str]) -> Subgoal:
+    def _predict_one(self, episode: Any, replies: list[str]) -> Subgoal:
         """Return the subgoal that the model names; each of its answers is added to `replies`."""
         raise NotImplementedError
 
@@ -195,7 +195,7 @@ class OpenAI(PromptedPredictor):
             return False
         return super().due(episode)
 
-    def _answer(self, episode: ConversationEpisode, replies: list[str]) -> Subgoal:
+    def _predict_one(self, episode: ConversationEpisode, replies: list[str]) -> Subgoal:
         message = episode.next_message()
         system = system_prompt(episode.task, self.kind)
         episode.again = True

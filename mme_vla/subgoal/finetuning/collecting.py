@@ -259,8 +259,8 @@ def _texts(subgoals: Iterable[Mapping[str, str]]) -> dict[str, list[str]]:
     """The subgoals of each kind, frame by frame."""
     texts: dict[str, list[str]] = {"simple": [], "grounded": []}
     for subgoal in subgoals:
-        for kind, so_far in texts.items():
-            so_far.append(subgoal[f"{kind}_subgoal"])
+        for kind, column in texts.items():
+            column.append(subgoal[f"{kind}_subgoal"])
     return texts
 
 
