@@ -196,6 +196,11 @@ class History:
         """The frames that have tokens, int64 [m], ascending."""
         raise NotImplementedError
 
+    def newest_stored(self, frames: np.ndarray) -> np.ndarray:
+        """For each of frames [n] the newest with tokens up to it, or the first."""
+        stored = self.stored_frames
+        return stored[np.maximum(np.searchsorted(stored, frames, side="right") - 1, 0)]
+
     def gather(self, indices: np.ndarray) -> Tensor:
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch)."""
         raise NotImplementedError
