@@ -234,7 +234,7 @@ class CoarserHistory(DerivedHistory):
     def gather(self, indices: np.ndarray) -> Tensor:
         if isinstance(self._source, PromptConditionedHistory):
             # As in training, the prompt conditions tokens that are pooled.
-            tokens = self._pooled(indices, self._source.unconditioned)
+            tokens = self._pooled(indices, self._source.stored)
             return self._source.with_prompt(tokens[None].float())[0]
         return self._pooled(indices, self._source.gather)
 

@@ -48,24 +48,26 @@ def under(
 def test_past_states_change_places_and_are_taken_from_another_episode() -> None:
     """Those of `spacetime`, which reads states beside its past images."""
     probe, episode = observed("spacetime_context")
-    plain = under("noise:0", probe, episode).features
+    unprobed = under("noise:0", probe, episode).features
     shuffled = under("shuffle", probe, episode).features
-    assert not torch.equal(shuffled, plain)
-    assert torch.equal(shuffled.sort(0).values, plain.sort(0).values)
+    assert not torch.equal(shuffled, unprobed)
+    assert torch.equal(shuffled.sort(0).values, unprobed.sort(0).values)
     other, donor = observed("spacetime_context", seed=1)
     donor_store = other.channel.read(donor.inner).stores[0]
     swapped = under("swap", probe, episode, donor_store).features
     assert torch.equal(swapped, under("noise:0", other, donor).features)
-    assert not torch.equal(under("noise:0.5", probe, episode).features, plain)
+    assert not torch.equal(under("noise:0.5", probe, episode).features, unprobed)
 
 
 @pytest.mark.parametrize("name", ["framesamp_modul", "spacetime_context", "actions_modul"])
 def test_a_clock_that_runs_ahead_moves_all_times_and_leaves_ages(name: str) -> None:
     probe, episode = observed(name)
-    plain, late = under("noise:0", probe, episode), under("delay:64", probe, episode)
-    assert torch.equal(late.positions[late.mask][:, 0], plain.positions[plain.mask][:, 0] + 64)
-    assert late.ages is not None and plain.ages is not None
-    assert torch.equal(late.ages, plain.ages)
+    unprobed, late = under("noise:0", probe, episode), under("delay:64", probe, episode)
+    assert torch.equal(
+        late.positions[late.mask][:, 0], unprobed.positions[unprobed.mask][:, 0] + 64
+    )
+    assert late.ages is not None and unprobed.ages is not None
+    assert torch.equal(late.ages, unprobed.ages)
 
 
 @pytest.mark.parametrize(
@@ -116,17 +118,17 @@ def test_keyframes_remember_nothing_where_everything_is_removed() -> None:
 def test_frames_of_states_alone_hold_the_tokens_of_the_frame_before_them() -> None:
     """A joined memory of sparse images and dense states has entries without tokens."""
     probe, episode = observed("ttt_modul", memory=["tokendrop", {"name": "actions", "stride": 4}])
-    plain, shuffled = under("noise:0", probe, episode), under("shuffle", probe, episode)
-    assert torch.equal(shuffled.mask, plain.mask)
-    assert torch.equal(shuffled.positions, plain.positions)
-    assert not torch.equal(shuffled.features, plain.features)
+    unprobed, shuffled = under("noise:0", probe, episode), under("shuffle", probe, episode)
+    assert torch.equal(shuffled.mask, unprobed.mask)
+    assert torch.equal(shuffled.positions, unprobed.positions)
+    assert not torch.equal(shuffled.features, unprobed.features)
 
 
 def test_noise_on_states_is_in_standard_deviations_of_all_that_is_read() -> None:
     """As in training, not of each frame by itself: a frame of zeros gets some too."""
     probe, episode = observed("actions_modul", first_moving=LENGTH // 2)
-    plain, noisy = under("noise:0", probe, episode), under("noise:1", probe, episode)
-    rows = plain.features[plain.mask][:, :17]
+    unprobed, noisy = under("noise:0", probe, episode), under("noise:1", probe, episode)
+    rows = unprobed.features[unprobed.mask][:, :17]
     noise = noisy.features[noisy.mask][:, :17] - rows
     assert rows[0].abs().max() < 1e-5
     assert torch.allclose(noise[0].std(), rows.std(), rtol=0.5)
