@@ -196,6 +196,11 @@ class History:
         """The frames that have tokens, int64 [m], ascending."""
         raise NotImplementedError
 
+    def newest_stored(self, frames: np.ndarray) -> np.ndarray:
+        """For each of frames [n] the newest with tokens up to it, or the first."""
+        stored = self.stored_frames
+        return stored[np.maximum(np.searchsorted(stored, frames, side="right") - 1, 0)]
+
     def gather(self, indices: np.ndarray) -> Tensor:
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch)."""
         raise NotImplementedError
@@ -237,7 +242,9 @@ class History:
         return self.motion(frames)
 
     def proprio(self, frames: np.ndarray) -> Tensor:
-        """The robot's states at frames [n], normalised: [n, s] float32."""
+        """The robot's states at frames [n], normalised: [n, s] float32; what `select` may read, as
+        `stored`.
+        """
         return self.motion_rows(frames)[:, : self.state_width]
 
     def _rows_of(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -479,11 +486,7 @@ class PromptConditionedHistory(DerivedHistory):
         self.with_prompt = with_prompt
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self.with_prompt(self.unconditioned(indices)[None])[0]
-
-    def unconditioned(self, indices: np.ndarray) -> Tensor:
-        """What `gather` conditions."""
-        return self._source.gather(indices)
+        return self.with_prompt(self._source.gather(indices)[None])[0]
 
     def stored(self, indices: np.ndarray) -> Tensor:
         return self._source.stored(indices)

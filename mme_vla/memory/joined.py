@@ -133,19 +133,21 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         self, history: HistoryTokens, with_prompt: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
         features = []
-        for i, selection in self._split(history):
+        for i, part in self.split(history):
+            # In float32, as states beside tokens are: an episode conditions them so too.
+            selection = replace(part, features=part.features.float())
             features.append(self.memories[i].condition_on_prompt(selection, with_prompt).features)
         return replace(history, features=torch.cat(features, 1))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         memories = self.memories
         outputs: dict[int, MemoryTokens] = {}
-        for i, selection in self._split(history):
+        for i, selection in self.split(history):
             memories[i].reporting = self.reporting
             outputs[i] = encode_selection(memories[i], selection)
         return self._join([outputs[i] for i in range(len(memories))])
 
-    def _split(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:
+    def split(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:
         """Each member's index and selection, in the order in which they follow one another."""
         first, *others = self._order
         lengths = {i: self.memories[i].capacity for i in others}
@@ -232,8 +234,8 @@ class CoarserHistory(DerivedHistory):
     def gather(self, indices: np.ndarray) -> Tensor:
         if isinstance(self._source, PromptConditionedHistory):
             # As in training, the prompt conditions tokens that are pooled.
-            tokens = self._pooled(indices, self._source.unconditioned)
-            return self._source.with_prompt(tokens[None])[0]
+            tokens = self._pooled(indices, self._source.stored)
+            return self._source.with_prompt(tokens[None].float())[0]
         return self._pooled(indices, self._source.gather)
 
     def stored(self, indices: np.ndarray) -> Tensor:

@@ -106,10 +106,8 @@ class TransformedHistory(DerivedHistory):
         return np.flatnonzero(np.isin(self._frames.real, self._source.stored_frames))
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        stored = self._source.stored_frames
-        real = self._frames.real[indices[:, 0]]
-        newest = np.maximum(np.searchsorted(stored, real, side="right") - 1, 0)
-        tokens = self._source.gather(np.stack([stored[newest], indices[:, 1]], 1))
+        stored = self._source.newest_stored(self._frames.real[indices[:, 0]])
+        tokens = self._source.gather(np.stack([stored, indices[:, 1]], 1))
         return self._frames.perturb(tokens)
 
     def _motion(self, frames: np.ndarray) -> Tensor:

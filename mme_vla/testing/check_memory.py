@@ -24,7 +24,7 @@ LABELS = {"subtask_boundary", "subtask_index", "fact_visible", "fact_index"}
 _Kind = TypeVar("_Kind", bound=History)
 
 
-def check_memory(name: str, frames: int = 48, **options: Any) -> None:
+def check_memory(name: str, frames: int = 80, **options: Any) -> None:
     """Run every check on the memory that is registered under `name`, and print a line for each that
     passed.
 
@@ -449,7 +449,7 @@ def check_training(memory: Memory, frames: int) -> None:
             unused.append(name)
     assert not unused, (
         f"no gradient reaches {', '.join(unused)}: remove these parameters, or use them without"
-        " detach()."
+        f" detach(). If they need more than {frames} frames, check a longer episode (frames=…)."
     )
 
 

@@ -113,6 +113,22 @@ def test_the_prompt_conditions_the_same_tokens_in_training_and_in_an_episode() -
     assert torch.equal(met.tokens[met.mask], trained.tokens[trained.mask])
 
 
+@torch.no_grad()
+def test_the_prompt_conditions_tokens_beside_states_as_in_an_episode() -> None:
+    """States are float32, so a selection of both is, and tokens of an episode are bfloat16."""
+    memory = joined([FRAMES, "actions"]).eval()
+    episode = Episode(memory, 20, dtype=torch.bfloat16)
+
+    def with_prompt(tokens: torch.Tensor) -> torch.Tensor:
+        return tokens * torch.tensor(1.2345).to(tokens.dtype)
+
+    selection = stack_history([memory.gather_selection(episode.cached(), 19)])
+    trained = memory(memory.condition_on_prompt(selection, with_prompt))
+    history = PromptConditionedHistory(episode.cached(), with_prompt)
+    met = memory.encode([history], [memory.start_stream()])
+    assert torch.allclose(met.tokens[met.mask], trained.tokens[trained.mask], atol=1e-6)
+
+
 def test_budgets_are_shared_evenly_or_as_configured() -> None:
     assert [m.budget for m in joined(["framesamp", "ttt"]).memories] == [256, 256]
     assert [m.budget for m in joined(["framesamp", "ttt", "rmt"]).memories] == [160, 160, 160]

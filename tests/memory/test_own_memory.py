@@ -184,6 +184,11 @@ def test_a_constructor_without_the_widths_is_named(monkeypatch):
         check_memory("mistaken")
 
 
+def test_a_memory_of_first_last_and_other_frames_is_checked_with_its_defaults():
+    """The synthetic episode is long enough for frames between."""
+    check_memory("gist")
+
+
 def test_an_unknown_memory_leads_to_plugins():
     with pytest.raises(UserError, match=r"One of your own .* that `plugins` names\."):
         check_memory("qqqq")

@@ -3,7 +3,7 @@
 No network is changed: a channel gives the policy other entries in place of its own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import starmap
 from typing import Any
@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from mme_vla.extras.methods.writable_memory import WritableMemory
-from mme_vla.memory.base import NEVER, stack_history
+from mme_vla.memory.base import NEVER, MemoryModule, stack_history
 from mme_vla.memory.history import DerivedHistory, FrameScores, History, StorageSpec
+from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
@@ -173,28 +174,34 @@ class Exchanged(DerivedHistory):
         return self._source.stored(indices)
 
     def _motion(self, frames: np.ndarray) -> Tensor:
-        rows = []
-        for frame in frames.tolist():
-            history, its = self._places.get(frame, (self._source, frame))
-            rows.append(history.motion_rows(np.array([its], np.int64)))
-        return torch.cat(rows) if rows else self._source.motion_rows(frames)
+        return self._exchanged(frames, lambda history, its, rows: history.motion_rows(its))
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        # History → the rows of `indices` that it holds
+        def tokens(history: History, frames: np.ndarray, rows: list[int]) -> Tensor:
+            # Of a joined memory some frames are those of states alone.
+            stored = history.newest_stored(frames)
+            return history.gather(np.stack([stored, indices[rows, 1]], axis=1))
+
+        return self._exchanged(indices[:, 0], tokens)
+
+    def _exchanged(
+        self, frames: np.ndarray, read: Callable[[History, np.ndarray, list[int]], Tensor]
+    ) -> Tensor:
+        """What frames [n] hold, [n, w]: all of one history are read at once."""
+        its = frames.astype(np.int64)
+        # History → the rows of `frames` that it holds
         rows_of: dict[History, list[int]] = {}
-        its_indices = indices.astype(np.int64)
-        for row, frame in enumerate(indices[:, 0].tolist()):
-            history, its = self._places.get(frame, (self._source, frame))
-            its_indices[row, 0] = its
+        for row, frame in enumerate(frames.tolist()):
+            history, its[row] = self._places.get(frame, (self._source, frame))
             rows_of.setdefault(history, []).append(row)
         if not rows_of:
-            return self._source.gather(indices)
+            return read(self._source, its, [])
         order: list[int] = []
-        tokens = []
+        contents = []
         for history, rows in rows_of.items():
             order += rows
-            tokens.append(history.gather(its_indices[rows]))
-        return torch.cat(tokens)[np.argsort(order)]
+            contents.append(read(history, its[rows], rows))
+        return torch.cat(contents)[np.argsort(order)]
 
 
 @dataclass(frozen=True)
@@ -291,12 +298,13 @@ class SelectionChannel(Channel):
             positions[its, 0] = 0.0 if entry is None else float(entry.time)
             mask[its] = entry is not None
         mask_3d = mask[:, None]
-        return HistoryTokens(
+        remembered = HistoryTokens(
             tokens.features.masked_fill(~mask_3d, 0),
             positions.masked_fill(~mask_3d, 0),
             mask,
             torch.tensor(store.now),  # among `only` some frames the view counts these alone
         )
+        return without_gaps(self._memory, remembered)
 
     def predict_chunk(
         self,
@@ -307,6 +315,31 @@ class SelectionChannel(Channel):
     ) -> Tensor:
         batch = replace(batch, history=stack_history(remembering, self._policy.device))
         return self._policy.sample_actions(batch, draws, steps)
+
+
+def without_gaps(memory: MemoryModule, history: HistoryTokens) -> HistoryTokens:
+    """An unbatched selection without gaps, for encoders that read several tokens together: these
+    count on padding at one end. Where each token is encoded by itself, the others keep their slots.
+    """
+    if isinstance(memory, JoinedMemory):
+        parts = []
+        for i, selection in memory.split(stack_history([history])):
+            parts.append(without_gaps(memory.memories[i], selection.rows(torch.tensor(0))))
+        return replace(
+            history,
+            features=torch.cat([part.features for part in parts]),
+            positions=torch.cat([part.positions for part in parts]),
+            mask=torch.cat([part.mask for part in parts]),
+        )
+    if not memory.pad_left and memory.capacity == memory.budget:
+        return history
+    order = history.mask.int().argsort(stable=True, descending=not memory.pad_left)
+    return replace(
+        history,
+        features=history.features[order],
+        positions=history.positions[order],
+        mask=history.mask[order],
+    )
 
 
 class WritableChannel(Channel):

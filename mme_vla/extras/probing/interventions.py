@@ -162,8 +162,8 @@ class Swap(Perturbation):
 @PERTURBATIONS.register("delay")
 @dataclass(frozen=True)
 class Delay(Perturbation):
-    """All entries seem to be from `frames` later, the current one too: a clock that runs ahead.
-    Negative: behind.
+    """The clock runs `frames` ahead: all entries seem to be from later, and the current frame too,
+    so that ages stay. Negative: behind.
 
     Of banks that count chunks, so many chunks.
     """
@@ -184,7 +184,7 @@ class Delay(Perturbation):
             entry = shifted[slot]
             assert entry is not None
             shifted[slot] = replace(entry, time=entry.time + self.frames)
-        return replace(store, entries=tuple(shifted))
+        return replace(store, entries=tuple(shifted), now=store.now + self.frames)
 
 
 @PERTURBATIONS.register("recent")

@@ -124,7 +124,7 @@ class Keyframes(FrameMemory, PerceptualMemory, ReadsLabels):
         ranks = scores.detach().masked_fill(~valid, -2 * LARGE)
         highest = functional.max_pool1d(ranks[:, None], kernel_size=3, stride=1, padding=1)[:, 0]
         ranks = ranks - LARGE * (ranks < highest)
-        newest = valid.sum(1, keepdim=True) - 1
+        newest = (valid.sum(1, keepdim=True) - 1).clamp(min=0)
         ends = torch.cat([torch.zeros_like(newest), newest], 1)
         ranks = ranks.scatter(1, ends, LARGE)
         return ranks.topk(self.frames, dim=1).indices.sort(1).values

@@ -115,7 +115,7 @@ class SpaceTime(MemoryModule):
             """The robot's states of frames [n]; zeros where none are read."""
             if self.states is None:
                 return torch.zeros(len(frames), self.d_vision)
-            states = history.proprio(frames)
+            states = history.motion_rows(frames)[:, : history.state_width]
             if states.shape[1] > self.state_dim:
                 raise UserError(
                     f"memory.state_dim={self.state_dim}: a state of this robot has"
