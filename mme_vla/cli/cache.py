@@ -1,18 +1,16 @@
 """`mme-vla cache model=… data=…`: build vision caches; `torchrun` shares the episodes out."""
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 from omegaconf import DictConfig
 
 from mme_vla.config.composition import resolved
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
-from mme_vla.data.cache import cache_folder, default_cache_root, fingerprint
+from mme_vla.data.cache import cache_folder, fingerprint
 from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
 from mme_vla.data.sources import open_sources
-from mme_vla.errors import UserError, counted
+from mme_vla.errors import UserError, counted, require
 from mme_vla.policy.build import build_from_config
 from mme_vla.training.runs import start_from, weights_to_start_from
 from mme_vla.training.settings import TrainRun
@@ -36,11 +34,12 @@ def main(cfg: DictConfig) -> None:
     command = read_section(CacheRun, config, others=True)
     training = TrainRun.from_config(config)
     settings = training.data.cache
-    if command.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise UserError(
-            "rebuild=true removes files that other processes write: run it once without torchrun"
-            " first."
-        )
+    rank, world = process_rank()
+    require(
+        not command.rebuild or world <= 1,
+        "rebuild=true removes files that other processes write: run it once without torchrun"
+        " first.",
+    )
     init_from = weights_to_start_from(training.init_from)
     policy = build_from_config(cfg, fresh_backbone=init_from is None)
     if init_from is not None:
@@ -51,19 +50,19 @@ def main(cfg: DictConfig) -> None:
         raise UserError(f"model={training.name} has no memory: there is nothing to cache.")
     tower = policy.vision_fingerprint()
     dtype = str(policy.info.history_dtype).removeprefix("torch.")
-    root = Path(settings.root) if settings.root else default_cache_root()
     for source in open_sources(training.data.sources, policy.embodiment):
         expected = fingerprint(source, memory.storage, tower, dtype)
-        folder = cache_folder(root, source, expected)
+        folder = cache_folder(settings.root, source, expected)
         if command.dry_run:
-            plan = estimate(source, memory, policy.encode_frames, dtype, settings.batch_size)
+            n_frames, n_bytes, seconds = estimate(
+                source, memory, policy.encode_frames, dtype, settings.batch_size
+            )
             print(
-                f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode,"
-                f" {plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process"
-                f" on {device}"
+                f"{source.name}: {n_frames} of {int(source.lengths.sum())} frames to encode,"
+                f" {n_bytes / 1e9:.3g} GB at {folder}, about {seconds:.0f} s in one process on"
+                f" {device}"
             )
             continue
-        rank, world = process_rank()
         if rank == 0:
             source.verify()  # its images are all about to be read, and for the last time
         # Beside the folder, and one for each share: processes that take other shares, or train, are

@@ -24,11 +24,11 @@ from mme_vla.policy.finetune import (
     copy_tower,
     warn_of_frozen_random_weights,
 )
-from mme_vla.policy.run_folders import find_run, training_name
+from mme_vla.policy.run_folders import training_name
 from mme_vla.policy.tensor_files import take_memory
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import identify
-from mme_vla.training.checkpoint import check_disk, load_policy, read_state
+from mme_vla.training.checkpoint import check_disk, read_state, restore_weights
 from mme_vla.training.data import SplitData, check_frozen, prepare_data
 from mme_vla.training.logging import Loggers, ProgressLine, check_logger, open_loggers
 from mme_vla.training.loop import Trainer, finish
@@ -38,11 +38,10 @@ from mme_vla.training.runs import (
     SUMMARY,
     Run,
     check_content,
-    check_kind,
     claim_run,
     open_run,
+    open_trainings,
     start_from,
-    unfinished_trainings,
     weights_to_start_from,
 )
 from mme_vla.training.settings import TrainRun
@@ -74,9 +73,8 @@ def main(cfg: DictConfig) -> None:
         distributed.destroy_process_group()
 
 
-def train_several(run: TrainRun, folder: Path, named: bool = True) -> list[Path]:
-    """Train several policies by one recipe, with consecutive seeds, one after the other; their last
-    checkpoints.
+def train_several(run: TrainRun, folder: Path, named: bool) -> None:
+    """Train several policies by one recipe, with consecutive seeds, one after the other.
 
     Each has a numbered folder in `folder`. Finished ones are left as they are, and one that was
     interrupted resumes. All have the vision tower of the first, frozen or to begin with, and so one
@@ -88,13 +86,7 @@ def train_several(run: TrainRun, folder: Path, named: bool = True) -> list[Path]
     Raises:
         UserError: a training there by other settings, or a single run.
     """
-    if run.resume == "auto" and not named:
-        folder = unfinished_trainings(folder, run.trainings)
-    elif run.resume not in (None, "auto"):
-        folder = find_run(Path(run.resume))
-        require(folder.is_dir(), f"resume={run.resume}: there is no such folder of trainings.")
-    check_kind(folder, several=True)
-    checkpoints = []
+    folder = open_trainings(folder, run.resume, run.trainings, named)
     for number in range(run.trainings):
         place = folder / training_name(number)
         own = {"seed": run.seed + number, "output": str(place), "resume": "auto"}
@@ -104,11 +96,9 @@ def train_several(run: TrainRun, folder: Path, named: bool = True) -> list[Path]
         line = f"training {number + 1} of {run.trainings}, seed {one.seed}, in {place}"
         if is_finished and existing.checkpoint is not None:
             print(f"{line}: finished")
-            checkpoints.append(existing.checkpoint)
             continue
         print(line)
-        checkpoints.append(train(one, place, time.perf_counter(), tower_seed=run.seed))
-    return checkpoints
+        train(one, place, time.perf_counter(), tower_seed=run.seed)
 
 
 def train(
@@ -196,6 +186,8 @@ def _train(
     config = config_of(run, place)
     digests = {"content": data.content, "side_files": data.side_files}
     saved_config = {**config, "data": {**config["data"], **digests}}
+    settings = config["train"].items()
+    recipe = {key: value for key, value in settings if not isinstance(value, dict)}
     trainer = Trainer(
         policy,
         data.train,
@@ -206,7 +198,7 @@ def _train(
         saved_config,
         accelerator,
         facts={
-            "card": {"data": run.data.name, "recipe": recipe(config)},
+            "card": {"data": run.data.name, "recipe": recipe},
             TRAINING: identify(config, data.content),
             "data": {"action_offset": run.data.action_offset},
         },
@@ -227,7 +219,6 @@ def _train(
     with closing(loggers):
         with line:
             finished = trainer.run(line, loggers)
-            trainer.close()
         if finished:
             finish(trainer, data, time.perf_counter() - begun, line, loggers)
         else:
@@ -264,7 +255,7 @@ def build_trainee(
         apply_finetuning(policy, **vars(run.finetune), seed=run.seed)
     if place.checkpoint is not None:
         if has_weights:
-            load_policy(place.checkpoint, policy)
+            restore_weights(place.checkpoint, policy)
             cast_frozen(policy, run.finetune.frozen_dtype)
         line.say(f"continuing from {place.checkpoint}")
     return policy
@@ -344,9 +335,3 @@ def config_of(run: TrainRun, place: Run) -> dict[str, Any]:
     ranges = {"narrow_ranges": began_with["data"].get("narrow_ranges")}
     values = {"init_from": began_with.get("init_from"), "data": {**run.config["data"], **ranges}}
     return {**run.config, **values}
-
-
-def recipe(config: dict[str, Any]) -> dict[str, Any]:
-    """The settings of the training that a model card lists."""
-    settings = config["train"].items()
-    return {key: value for key, value in settings if not isinstance(value, dict)}

@@ -67,9 +67,9 @@ def fingerprint(
     }
 
 
-def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) -> Path:
-    """The folder of a cache below `root`: readable, and another one for another dataset, encoder,
-    pooling or camera.
+def cache_folder(root: Path | str | None, source: EpisodeSource, expected: dict[str, Any]) -> Path:
+    """The folder of a cache below `root`, or below `default_cache_root()`: readable, and another
+    one for another dataset, encoder, pooling or camera.
     """
     spec = StorageSpec(**expected["storage"])
     scorer = f"-{spec.scorer}" if spec.scorer else ""
@@ -80,7 +80,8 @@ def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) ->
     if expected["view"] != ROBOMME_JOINT.cameras[0].key:
         view = re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
     name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}{view}-{encoder}"
-    return root / f"{source.name}-{source.fingerprint[:8]}" / name
+    caches = Path(root) if root else default_cache_root()
+    return caches / f"{source.name}-{source.fingerprint[:8]}" / name
 
 
 def stored_frames(source: EpisodeSource, episode: int, spec: StorageSpec) -> np.ndarray:
@@ -245,11 +246,11 @@ def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COM
     """Make sure that `folder` was made of what is expected."""
     path = folder / FINGERPRINT
     if not path.is_file():
-        if folder.is_dir() and any(folder.iterdir()):
-            raise UserError(
-                f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another"
-                " data.cache.root."
-            )
+        require(
+            not folder.is_dir() or not any(folder.iterdir()),
+            f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another"
+            " data.cache.root.",
+        )
         raise CacheMissingError(f"There is no vision cache at {folder}. Build it with: {command}")
     recorded = read_json(path, "what a vision cache was made of")
     differences = []

@@ -25,7 +25,6 @@ from mme_vla.data.cache import (
     VisionCache,
     cache_folder,
     check_fingerprint,
-    default_cache_root,
     fingerprint,
     score_file,
     stored_frames,
@@ -45,17 +44,6 @@ CHUNKS_AHEAD = 2
 Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """What building would take: frames to encode, bytes on disk, seconds (one process), as measured
-    on a few frames.
-    """
-
-    frames: int
-    bytes: int
-    seconds: float
-
-
 def process_rank() -> tuple[int, int]:
     """(rank, world size) as torchrun gives them, (0, 1) without it."""
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
@@ -65,10 +53,10 @@ def clear_cache(folder: Path) -> None:
     """Remove the files of a cache, and nothing else."""
     if not folder.exists():
         return
-    if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
-        raise UserError(
-            f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed."
-        )
+    require(
+        (folder / FINGERPRINT).is_file() or not any(folder.iterdir()),
+        f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed.",
+    )
     for pattern in ("episode_*.np[yz]", "episode_*.sha256", "*.partial", FINGERPRINT):
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)
@@ -123,8 +111,12 @@ def estimate(
     encode: Encode,
     dtype: str = "bfloat16",
     batch_size: int = 32,
-) -> Estimate:
-    """Measure a few batches of the first episode and extrapolate to the dataset."""
+) -> tuple[int, int, float]:
+    """Measure a few batches of the first episode and extrapolate to the dataset.
+
+    Returns:
+        The frames to encode, their bytes on disk, and the seconds that it takes one process.
+    """
     n_stored = 0
     for episode in range(len(source)):
         n_stored += len(stored_frames(source, episode, memory.storage))
@@ -140,7 +132,7 @@ def estimate(
         if time.perf_counter() - started > 5:
             break
     seconds = (time.perf_counter() - started) / n_frames * int(source.lengths.sum())
-    return Estimate(n_stored, n_stored * bytes_per_frame, seconds)
+    return n_stored, n_stored * bytes_per_frame, seconds
 
 
 @dataclass(frozen=True)
@@ -301,7 +293,7 @@ def ensure_cache(
             coded,
         )
     expected = fingerprint(source, memory.storage, encoder, dtype)
-    folder = cache_folder(default_cache_root() if root is None else Path(root), source, expected)
+    folder = cache_folder(root, source, expected)
     try:
         return VisionCache(folder, source, expected, command)
     except CacheMissingError as error:

@@ -1,6 +1,6 @@
 """Further columns of a dataset: labels and weights of samples."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -32,18 +32,20 @@ FACT_VISIBLE = "fact_visible"
 
 def with_labels(
     selection: HistoryTokens,
-    labels: Mapping[str, Callable[[np.ndarray], np.ndarray]],
+    labels: Mapping[str, np.ndarray],
     real: np.ndarray | None = None,
 ) -> HistoryTokens:
     """A selection, unbatched, with the labels of each token's frame.
 
-    labels: name → values [n] or [n, k] float32 of an episode's frames [n].
+    labels: name → values [t] or [t, k] float32 of an episode's frames.
     real: the recorded frame of each frame of a transformed episode (`FrameMap.real`).
     """
     frames = (selection.positions[:, 0] * selection.mask).numpy().astype(np.int64)
+    if real is not None:
+        frames = real[frames]
     tokens = Labels()
-    for name, read in labels.items():
-        values = torch.from_numpy(read(frames if real is None else real[frames]))
+    for name, of_frames in labels.items():
+        values = torch.from_numpy(of_frames[frames])
         tokens[name] = values * selection.mask.view(-1, *[1] * (values.ndim - 1))
     return replace(selection, labels=tokens)
 

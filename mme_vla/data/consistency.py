@@ -104,7 +104,7 @@ def _check_totals(dataset: Description) -> None:
                 f"{dataset.root}/meta/info.json: {key} is {brief(declared)}, but meta/episodes"
                 f" describes {count} {what}. {CORRECT}"
             )
-    listed = dataset.episodes.declared_lengths
+    listed = dataset.declared_lengths
     if listed is None:
         return
     episode = first_wrong(listed != lengths)
@@ -119,7 +119,7 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
     """Make sure that rows lie in the order of episodes and of time, none missing and none twice,
     and that time is frame / fps.
     """
-    root, fps, lengths = dataset.root, dataset.fps, dataset.lengths
+    root, fps, lengths = dataset.root, dataset.info.fps, dataset.lengths
     total = int(lengths.sum())
     require(
         "episode_index" in rows,
@@ -222,7 +222,7 @@ def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> No
 
 def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTasks:
     """The task of every frame: by `task_index` as LeRobot does, else as listed for its episode."""
-    root, starts, listed_tasks = dataset.root, dataset.starts, dataset.episodes.tasks
+    root, starts, listed_tasks = dataset.root, dataset.starts, dataset.tasks
     meta = root / "meta" / "episodes"
     if "task_index" not in rows:
         for episode, tasks in enumerate(listed_tasks):

@@ -2,7 +2,7 @@
 
 import logging
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.columns import label_column, text_column, weight_column, with_labels
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, require
+from mme_vla.errors import require
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import History
 from mme_vla.memory.perturbation import Perturbation
@@ -55,54 +55,6 @@ class Step:
     recorded: np.ndarray
 
 
-@dataclass(frozen=True)
-class ColumnNames:
-    """Columns of a dataset that training reads beside a robot's own.
-
-    labels: of the current frame, that the backbone reads; those of the memory follow from it.
-    weights: the column of sample weights.
-    """
-
-    labels: Sequence[str] = ()
-    weights: str | None = None
-
-
-class FurtherColumns:
-    """Labels and sample weights of one dataset, read and checked once; see `ColumnNames`."""
-
-    def __init__(
-        self, source: EpisodeSource, names: ColumnNames, memory_labels: Sequence[str]
-    ) -> None:
-        self._source = source
-        self._current = tuple(names.labels)
-        self._memory_labels = tuple(memory_labels)
-        self._labels: dict[str, np.ndarray] = {}
-        for name in (*names.labels, *memory_labels):
-            if name not in self._labels:
-                self._labels[name] = label_column(source, name, "The policy's labels")
-        self._weights = None if names.weights is None else weight_column(source, names.weights)
-
-    def items(self, episode: int, frame: int) -> dict[str, Any]:
-        """What a sample at a frame has of these: `labels` and `weight`, where there are any."""
-        (row,) = self._source.rows(episode, np.array([frame]))
-        items: dict[str, Any] = {}
-        if self._current:
-            labels = {name: torch.as_tensor(self._labels[name][row]) for name in self._current}
-            items["labels"] = labels
-        if self._weights is not None:
-            items["weight"] = torch.as_tensor(self._weights[row])
-        return items
-
-    def of_memory(self, episode: int) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
-        """The labels that the memory reads, by name: values of an episode's frames [n]."""
-
-        def read(name: str, frames: np.ndarray) -> np.ndarray:
-            values: np.ndarray = self._labels[name][self._source.rows(episode, frames)]
-            return values
-
-        return {name: partial(read, name) for name in self._memory_labels}
-
-
 class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
@@ -124,7 +76,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         mask_padding: bool = False,
         jitter: bool = False,
         subgoal: SubgoalText | None = None,
-        columns: ColumnNames = ColumnNames(),
+        labels: Sequence[str] = (),
+        weights: str | None = None,
         seed: int = 42,
         transforms: Sequence[Perturbation] = (),
     ) -> None:
@@ -145,7 +98,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             jitter: hand the memory a random generator, for memories that vary their selection in
                 training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
-            columns: labels and sample weights.
+            labels: columns of the current frame that the backbone reads; those of the memory follow
+                from it.
+            weights: the column of sample weights.
             seed: of all randomness.
             transforms: of the frames of an episode, before anything reads its past.
         """
@@ -154,10 +109,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             "A policy with memory trains on cached vision tokens, one cache a source: build them"
             " with `mme-vla cache model=<model> data=<data>` and pass `caches`.",
         )
-        if not 0 <= action_offset <= 1:
-            raise UserError(
-                f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean)."
-            )
+        require(
+            0 <= action_offset <= 1,
+            f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).",
+        )
         require(
             not processor.prompt_spec.reads_subgoal or subgoal is not None,
             f"The prompt format {processor.prompt_spec.name!r} reads a subgoal: set"
@@ -196,9 +151,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.sources = list(sources)
         self.processor = processor
         self.memory = memory
-        self.caches: list[VisionCache] = []
-        if memory is not None and caches is not None:
-            self.caches = list(caches)
+        self.caches = list(caches or ())
         self.action_offset = action_offset
         self.mask_padding = mask_padding
         self.jitter = jitter
@@ -206,7 +159,19 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.seed = seed
         self.epoch = 0
         self.transforms = tuple(transforms)
-        self.columns = [FurtherColumns(source, columns, labels_read(memory)) for source in sources]
+        self._cameras = processor.samples.cameras or processor.embodiment.camera_names
+        # Labels and weights of every row of each source's tables.
+        self._labels = tuple(labels)
+        self._memory_labels = labels_read(memory)
+        self._label_values: list[dict[str, np.ndarray]] = []
+        self._weights: list[np.ndarray] = []
+        for source in sources:
+            values = {}
+            for name in dict.fromkeys((*self._labels, *self._memory_labels)):
+                values[name] = label_column(source, name, "The policy's labels")
+            self._label_values.append(values)
+            if weights is not None:
+                self._weights.append(weight_column(source, weights))
         # Source and number of each episode, and where its items end.
         if episodes is None:
             episodes = [np.arange(len(source)) for source in sources]
@@ -221,17 +186,12 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self._source = np.array(of_source, np.int64)
         self._episode = np.array(numbers, np.int64)
         self._ends = np.cumsum(counts, dtype=np.int64)
+        # Those at which the robot decides: all of the execution, or those before a planned motion.
+        self.steps = sum(counts)
         require(self.steps, "The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
         return self.steps
-
-    @property
-    def steps(self) -> int:
-        """Number of steps at which the robot decides: all of the execution, or those before a
-        planned motion.
-        """
-        return int(self._ends[-1]) if len(self._ends) else 0
 
     def decisions(self, source: int, episode: int) -> Any:
         """Frames of an episode at which the robot decides, without those that lack a full chunk
@@ -270,11 +230,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         """
         at = np.flatnonzero((self._source == source) & (self._episode == episode))
         decisions = np.asarray(self.decisions(source, episode))
-        if not len(at) or not len(decisions):
-            raise UserError(
-                f"{self.sources[source].name}: no step of episode {episode} is among the chosen"
-                " ones."
-            )
+        require(
+            len(at) and len(decisions),
+            f"{self.sources[source].name}: no step of episode {episode} is among the chosen ones.",
+        )
         place = int(np.searchsorted(decisions, frame))
         if place == len(decisions) or decisions[place] != frame:
             place = frame * len(decisions) // int(self.sources[source].lengths[episode])
@@ -366,8 +325,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         item = self.processor.item(self._sample(step, subgoal, now, frames))
         if self.mask_padding:
             item["action_mask"] = torch.from_numpy(step.recorded)
-        columns = self.columns[step.source]
-        item.update(columns.items(step.episode, step.index))
+        labels = self._label_values[step.source]
+        first = int(self.sources[step.source].starts[step.episode])  # of the episode's rows
+        if self._labels:
+            current = {name: labels[name][first + step.index] for name in self._labels}
+            item["labels"] = {name: torch.as_tensor(value) for name, value in current.items()}
+        if self._weights:
+            item["weight"] = torch.as_tensor(self._weights[step.source][first + step.index])
         if self.memory is not None:
             history: History = self.caches[step.source].history(step.episode)
             if self.memory.uses_proprio:
@@ -376,7 +340,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             if frames.transforms:
                 history = TransformedHistory(history, frames)
             selection = self.memory.gather_selection(history, now, rng if self.jitter else None)
-            item["history"] = with_labels(selection, columns.of_memory(step.episode), frames.real)
+            of_episode = {name: labels[name][first:] for name in self._memory_labels}
+            item["history"] = with_labels(selection, of_episode, frames.real)
             spec = self.memory.past_view_spec
             if spec is not None:
                 read = partial(self._images, step.source, step.episode, frames)
@@ -388,10 +353,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     ) -> list[np.ndarray]:
         recorded = shown.real[frames]
         return [self.sources[source].frames(episode, recorded, name) for name in self._cameras]
-
-    @property
-    def _cameras(self) -> Sequence[str]:
-        return self.processor.samples.cameras or self.processor.embodiment.camera_names
 
     def _motion(self, source: int, episode: int, frames: np.ndarray) -> Tensor:
         return motion_rows(

@@ -1,4 +1,4 @@
-"""The table `meta/episodes` of a LeRobot v3.0 dataset: rows, images and tasks of each episode."""
+"""What `meta/` says of the episodes of a LeRobot v3.0 dataset: their rows, images and tasks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,52 +29,26 @@ class VideoSpans:
 
 
 @dataclass(frozen=True)
-class EpisodeTable:
-    """`meta/episodes`.
+class Description:
+    """A dataset as `meta/info.json` and `meta/episodes` describe it.
 
-    starts, lengths: [e] int64, rows of the tables.
+    root: its folder.
+    info: meta/info.json.
+    starts, lengths: [e] int64, the first row of each episode and its frames.
     tasks: [e], those listed for each episode, none where they are not listed.
     declared_lengths: the lengths once more, where they are written.
-    videos: by column.
+    videos: of the cameras that are videos, by column.
+    images: columns of the cameras that are stored in the tables.
     """
 
+    root: Path
+    info: Info
     starts: np.ndarray
     lengths: np.ndarray
     tasks: list[tuple[str, ...]]
     declared_lengths: np.ndarray | None
     videos: Mapping[str, VideoSpans]
-
-
-@dataclass(frozen=True)
-class Description:
-    """What is compared: the parts of a dataset that were read already.
-
-    root: its folder.
-    info: meta/info.json.
-    episodes: meta/episodes.
-    videos, images: columns of the cameras that are videos, and of those stored in the tables.
-    """
-
-    root: Path
-    info: Info
-    episodes: EpisodeTable
-    videos: tuple[str, ...]
-    images: tuple[str, ...]
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self.info.fps
-
-    @property
-    def starts(self) -> np.ndarray:
-        """First row of each episode, [e] int64."""
-        return self.episodes.starts
-
-    @property
-    def lengths(self) -> np.ndarray:
-        """Frames of each episode, [e] int64."""
-        return self.episodes.lengths
+    images: Sequence[str]
 
     def place(self, row: int) -> str:
         """A row in words, by its episode and frame."""
@@ -82,7 +56,9 @@ class Description:
         return f"row {row}, frame {row - int(self.starts[episode])} of episode {episode}"
 
 
-def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable:
+def read_description(
+    root: Path, info: Info, video_columns: Sequence[str], image_columns: Sequence[str]
+) -> Description:
     """Read and check `meta/episodes`.
 
     Raises:
@@ -119,7 +95,8 @@ def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable
                 f" {REMEDY}"
             )
         tasks.append(tuple(texts))
-    return EpisodeTable(starts, stops - starts, tasks, columns.get("length"), videos)
+    lengths, declared = stops - starts, columns.get("length")
+    return Description(root, info, starts, lengths, tasks, declared, videos, image_columns)
 
 
 def _read_episode_columns(

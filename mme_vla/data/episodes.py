@@ -20,7 +20,7 @@ from mme_vla.data.consistency import (
     compare_units,
     have_other_units,
 )
-from mme_vla.data.episode_table import Description, read_episode_table
+from mme_vla.data.episode_table import read_description
 from mme_vla.data.frame_tables import check_vectors, flat, open_table, read_index_columns
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.image_consistency import check_mode
@@ -131,21 +131,16 @@ class EpisodeSource:
         sums.check(*(name for name in sums.table if name.startswith(opened)))
 
         # Episodes and rows.
-        self._episodes = read_episode_table(self.root, videos)
-        self.starts = self._episodes.starts
-        self.lengths = self._episodes.lengths
-        self._video_path = info.video_path
+        self._description = read_description(self.root, info, videos, images)
+        self.starts = self._description.starts
+        self.lengths = self._description.lengths
         self._reader = VideoReader(max_open_videos)
         self._motions: dict[int, Motions] = {}
         rendered = {camera: f"{camera}{RENDERED_SUFFIX}" for camera in self.columns}
         flags = ["is_demo", "exec_start_idx", *rendered.values()]
         rows = read_index_columns(self.root, features, flags)
         self._table = open_table(self.root, columns, features)
-        self.tasks, in_tables = check_consistency(
-            Description(self.root, info, self._episodes, videos, images),
-            rows,
-            self._table,
-        )
+        self.tasks, in_tables = check_consistency(self._description, rows, self._table)
         side_file = None if exec_starts is None else Path(exec_starts)
         self.exec_starts = self._read_exec_starts(rows, in_tables, side_file)
         self._rendered = {
@@ -172,14 +167,14 @@ class EpisodeSource:
         compare_units(self.root, action.names, action.units, scales["action"])
         places = list(action.relative)
         sizes = [scales[kind][places] for kind in ("state", "action")]
-        if have_other_units(*sizes):
-            raise UserError(
-                f"{self.root}: numbers {listed(place + 1 for place in places)} reach"
-                f" {brief(sizes[0].tolist())} in the state and {brief(sizes[1].tolist())} in the"
-                " action, which is predicted relative to the state: both need one unit (degrees and"
-                " radians differ by 57), and the action has to be a position, no difference."
-                " Convert one of them, or set embodiment.action.relative=[]."
-            )
+        require(
+            not have_other_units(*sizes),
+            f"{self.root}: numbers {listed(place + 1 for place in places)} reach"
+            f" {brief(sizes[0].tolist())} in the state and {brief(sizes[1].tolist())} in the"
+            " action, which is predicted relative to the state: both need one unit (degrees and"
+            " radians differ by 57), and the action has to be a position, no difference."
+            " Convert one of them, or set embodiment.action.relative=[].",
+        )
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -195,7 +190,7 @@ class EpisodeSource:
         The table of tasks counts where meta/episodes does not name the one task of every episode.
         """
         parts = ["data", "videos", "meta/episodes"]
-        if any(len(texts) != 1 for texts in self._episodes.tasks):
+        if any(len(texts) != 1 for texts in self._description.tasks):
             parts.append(TASKS)
         return content_fingerprint(self.root, parts)
 
@@ -213,19 +208,13 @@ class EpisodeSource:
         episode = int(np.searchsorted(self.starts, row, side="right")) - 1
         return episode, row - int(self.starts[episode])
 
-    def rows(self, episode: int, frames: np.ndarray) -> np.ndarray:
-        """Rows of the tables that hold frames [n] of an episode, int64 [n]: the inverse of
-        `locate`.
-        """
-        return int(self.starts[episode]) + np.asarray(frames, np.int64)
-
     def task(self, episode: int) -> str:
         """Name of the episode's task (`VideoUnmask`), empty if the dataset does not tell."""
         task = self.records[episode].get("task", "") if episode < len(self.records) else ""
-        if not isinstance(task, str):
-            raise UserError(
-                f"{self.root / SIDE_FILE}: the task of episode {episode} is {brief(task)}. {REMEDY}"
-            )
+        require(
+            isinstance(task, str),
+            f"{self.root / SIDE_FILE}: the task of episode {episode} is {brief(task)}. {REMEDY}",
+        )
         return task
 
     def verify(self) -> int:
@@ -423,16 +412,17 @@ class EpisodeSource:
             )
         column = self.columns[camera]
         if camera in self.video_cameras:
-            spans = self._episodes.videos[column]
+            spans = self._description.videos[column]
             chunk, file = int(spans.chunk[episode]), int(spans.file[episode])
-            path = video_file(self.root, self._video_path, column, chunk, file)
+            template = self._description.info.video_path
+            path = video_file(self.root, template, column, chunk, file)
             timestamps = float(spans.begin[episode]) + indices / self.fps
             return self._reader.read(path, timestamps, self.fps)
         from PIL import Image
 
         pixels = []
         with decoding(f"{self.root}, episode {episode}, {column}", "pictures", REMEDY):
-            for row in self.rows(episode, indices).tolist():
+            for row in (int(self.starts[episode]) + indices).tolist():
                 cell = self._table[row : row + 1][column][0].as_py()
                 picture = Image.open(io.BytesIO(cell["bytes"]))
                 check_mode(self.root, column, picture)
@@ -528,5 +518,7 @@ class EpisodeSource:
 
 def check_episode(source: EpisodeSource, episode: Any) -> None:
     """Refuse an episode that a dataset does not have."""
-    if not isinstance(episode, int) or not 0 <= episode < len(source):
-        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    require(
+        isinstance(episode, int) and 0 <= episode < len(source),
+        f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.",
+    )

@@ -114,15 +114,15 @@ def check_videos(dataset: Description, column: str) -> None:
     the files.
     """
     meta = f"{dataset.root}/meta/episodes"
-    spans = dataset.episodes.videos[column]
+    spans = dataset.videos[column]
     if spans.end is not None:
-        frames = (spans.end - spans.begin) * dataset.fps
+        frames = (spans.end - spans.begin) * dataset.info.fps
         episode = first_wrong(~(np.abs(frames - dataset.lengths) <= HALF))
         if episode is not None:
             raise UserError(
                 f"{meta}: the pictures of {column} of episode {episode} lie between"
                 f" {spans.begin[episode]:.4f} s and {spans.end[episode]:.4f} s,"
-                f" {frames[episode]:.2f} frames at fps={dataset.fps:g}, but the episode has"
+                f" {frames[episode]:.2f} frames at fps={dataset.info.fps:g}, but the episode has"
                 f" {dataset.lengths[episode]} frames. {CORRECT}"
             )
     # Which episodes each file holds, in the order of their images.
@@ -136,8 +136,8 @@ def check_videos(dataset: Description, column: str) -> None:
     # No two episodes have the same pictures of a file.
     for path, episodes in episodes_of.items():
         begins = spans.begin[episodes]
-        ends = begins + dataset.lengths[episodes] / dataset.fps
-        k = first_wrong((ends[:-1] - begins[1:]) * dataset.fps > HALF)
+        ends = begins + dataset.lengths[episodes] / dataset.info.fps
+        k = first_wrong((ends[:-1] - begins[1:]) * dataset.info.fps > HALF)
         if k is not None:
             raise UserError(
                 f"{meta}: episodes {episodes[k]} and {episodes[k + 1]} overlap in the video"
@@ -166,8 +166,8 @@ def _check_file(
     require(
         path.is_file(), f"{path} is missing: the dataset is incomplete. Copy or download it again."
     )
-    begins = dataset.episodes.videos[column].begin[episodes]
-    lengths, fps = dataset.lengths[episodes], dataset.fps
+    begins = dataset.videos[column].begin[episodes]
+    lengths, fps = dataset.lengths[episodes], dataset.info.fps
     firsts = np.cumsum(lengths) - lengths
     total = int(lengths.sum())
     with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import brief, require
 from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
 from mme_vla.policy.sections import PolicySections
@@ -95,11 +95,11 @@ class Recording:
             UserError: the robot reads depth, which a dataset has no columns for.
         """
         robot = self.source.robot
-        if robot.readings:
-            raise UserError(
-                f"The robot {robot.name!r} reads {', '.join(robot.readings)}, and {self.name} holds"
-                " images alone: a recorded episode cannot be shown to it."
-            )
+        require(
+            not robot.readings,
+            f"The robot {robot.name!r} reads {', '.join(robot.readings)}, and {self.name} holds"
+            " images alone: a recorded episode cannot be shown to it.",
+        )
         views, rendered = {}, {}
         for name in robot.camera_names:
             frames: np.ndarray = np.arange(start, stop)
@@ -147,10 +147,7 @@ class Recording:
             actions = self.source.actions(self.episode)[frames - 1 + self.action_offset]
         states = self.source.states(self.episode, start, stop)
         views, rendered = self.views(start, stop, required)
-        if rendered is None:
-            running.observe(views, states, demo, actions)
-        else:
-            running.observe(views, states, demo, actions, rendered=rendered)
+        running.observe(views, states, demo, actions, rendered=rendered)
 
 
 def action_offset_of(policy: Policy) -> int:

@@ -60,7 +60,6 @@ from mme_vla.utils import checked_file, inside, read_json, write_sums
 FORMAT = "mme_vla training checkpoint 1"
 RAW, OPTIMIZER = "raw.safetensors", "optimizer.safetensors"
 _STATE_KEYS = ("format", "step", "config", "versions", "shards")
-_ADAM = (*MOMENTS, "step")
 
 
 def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
@@ -89,7 +88,8 @@ def save_checkpoint(
     """
     from safetensors.torch import save_file
 
-    target, draft = _places(folder, step)
+    target = folder / checkpoint_name(step)
+    draft = folder / f".{target.name}.partial"
     shutil.rmtree(draft, ignore_errors=True)
     with ema.applied():
         save_policy(policy, draft, facts=facts, self_check=self_check)
@@ -99,7 +99,7 @@ def save_checkpoint(
     moments = {}
     for name, p in parameters.items():
         if p in optimizer.state:
-            for key in _ADAM:
+            for key in (*MOMENTS, "step"):
                 moment = optimizer.state[p][key]
                 moments[f"{name}/{key}"] = moment.detach().cpu().contiguous()
     save_file(moments, draft / OPTIMIZER)
@@ -122,7 +122,7 @@ def save_shards(
     facts: Mapping[str, Any] | None = None,
     hurry: bool = False,
     self_check: SelfCheck | None = None,
-) -> Path:
+) -> None:
     """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the
     copies alone.
 
@@ -131,7 +131,8 @@ def save_shards(
         hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's
             weights into it after; otherwise it appears whole or not at all.
     """
-    target, draft = _places(folder, step)
+    target = folder / checkpoint_name(step)
+    draft = folder / f".{target.name}.partial"
     first = distributed.get_rank() == 0
     writer.wait()  # the checkpoint before
     with ema.applied():
@@ -157,10 +158,9 @@ def save_shards(
     writer.write(
         draft, training_tensors(policy, ema.tensors(), optimizer, trainable(policy)), finish
     )
-    return target
 
 
-def load_policy(checkpoint: Path, policy: Policy) -> None:
+def restore_weights(checkpoint: Path, policy: Policy) -> None:
     """Give a policy, on meta or not, the weights that a run continues from; `restore` brings all
     else.
     """
@@ -298,11 +298,6 @@ def tidy(folder: Path, keep: KeepRule) -> None:
             path.rename(folder / f".{path.name}.partial")
     for path in folder.glob(".step_*.partial"):
         shutil.rmtree(path)
-
-
-def _places(folder: Path, step: int) -> tuple[Path, Path]:
-    target = folder / checkpoint_name(step)
-    return target, folder / f".{target.name}.partial"
 
 
 def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any) -> None:

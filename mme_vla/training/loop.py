@@ -2,9 +2,8 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,8 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.recording import Recording
-from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.errors import UserError, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.self_check import SelfCheck, try_self_check
 from mme_vla.speed import Recomputes
@@ -134,7 +132,6 @@ class Trainer:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
         # What an update calls: sharded weights exchange gradients themselves, others through DDP.
         self._replicated = policy if self.sharded else accelerator.prepare_model(policy)
-        self._parameters = list(parameters.values())
         # What a CPU takes for it was not measured.
         on_gpu = accelerator.device.type == "cuda"
         is_adamw = isinstance(self.optimizer, torch.optim.AdamW)
@@ -171,7 +168,7 @@ class Trainer:
     def describe(self) -> str:
         """What is trained, where, in one line."""
         total = sum(p.numel() for p in self.policy.parameters())
-        trained = sum(p.numel() for p in self._parameters)
+        trained = sum(p.numel() for p in trainable(self.policy).values())
         device = str(self.accelerator.device)
         if self.accelerator.num_processes > 1:
             device = f"{self.accelerator.num_processes} × {device}"
@@ -188,37 +185,45 @@ class Trainer:
             checkpoint first.
         """
         settings = self.settings
-        window = Window(settings.batch_size)
         if self.run_info.step >= settings.steps:  # killed between its last step and its end
             if self.accelerator.is_main_process:
                 tidy(self.run_info.checkpoints, settings.keep)
             return True
         # A finished run that trains on is unfinished until its new end: `resume=auto` finds it.
         (self.run_info.folder / SUMMARY).unlink(missing_ok=True)
+        memory = self.policy.memory
+        window = Window(settings.batch_size)
         batches = iter(self.loader)
         with stop_requests() as stop:
             for step in range(self.run_info.step, settings.steps):
                 done = step + 1
-                with _reporting(self.policy.memory, self._due(done)):
-                    window.add(self.update(step, batches, window))
-                line.advance()
-                stopping = stop() and done < settings.steps
-                saving = stopping or done == settings.steps or done % settings.save_every == 0
+                is_last = done == settings.steps
+                saving = is_last or done % settings.save_every == 0
                 # A window ends with every checkpoint, so that a resumed run has the same windows.
-                if saving or self._due(done):
+                logging = saving or done % settings.log_every == 0
+                if memory is not None:
+                    memory.reporting = logging
+                window.add(self.update(step, batches, window))
+                if memory is not None:
+                    memory.reporting = False
+                line.advance()
+                stopping = stop() and not is_last
+                if logging or stopping:
                     self._log(done, window, line, loggers)
                 with window.pause():
-                    if done % settings.val_every == 0 or done == settings.steps:
+                    if is_last or done % settings.val_every == 0:
                         self.validate(done, line, loggers)
-                    if saving:
+                    if saving or stopping:
                         self.save(done, stopping)
                         if self.unchecked is not None:
                             line.say(f"no self-check in the checkpoint: {self.unchecked}")
                 if stopping:
                     self.stopped_by = stop.signal
                     line.say(f"Stopped at step {done} as asked.")
-                    return False
-        return True
+                    break
+        if self._shard_writer is not None:  # the last checkpoint may not be on disk yet
+            self._shard_writer.close()
+        return self.stopped_by is None
 
     def update(
         self, step: int, batches: Iterator[Any], window: Window
@@ -248,8 +253,14 @@ class Trainer:
                 seed_of(settings.seed, "model", step, piece, self.accelerator.process_index)
             )
             piece_draws = {name: send(value[rows], device) for name, value in draws.items()}
+            # Gradients add up here, until those of the last piece send them to other processes.
             is_last = piece == settings.accumulate - 1
-            with self._gradients_shared(is_last):
+            apart: AbstractContextManager[object] = nullcontext()
+            if self.sharded:
+                self.policy.set_requires_gradient_sync(is_last)  # type: ignore[operator]
+            elif not is_last:
+                apart = self.accelerator.no_sync(self._replicated)
+            with apart:
                 loss, metrics = self._replicated(batch, piece_draws)
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
@@ -257,24 +268,12 @@ class Trainer:
                 sums[name] = sums[name] + part if name in sums else part
         return {**sums, "grad_norm": full_value(self.update_weights(step)), "lr": rate}
 
-    @contextmanager
-    def _gradients_shared(self, shared: bool) -> Iterator[None]:
-        """Whether the backward passes within send their gradients to the other processes, or add up
-        their own.
-        """
-        if self.sharded:
-            self.policy.set_requires_gradient_sync(shared)  # type: ignore[operator]
-            yield
-        else:
-            with nullcontext() if shared else self.accelerator.no_sync(self._replicated):
-                yield
-
-    def validate(self, step: int, line: ProgressLine, loggers: Loggers) -> float | None:
+    def validate(self, step: int, line: ProgressLine, loggers: Loggers) -> None:
         """Log the loss of the averaged weights on held-out steps, of which every process takes its
         share.
         """
         if self.validation is None:
-            return None
+            return
         with self.ema.applied():
             loss = self.validation.loss(
                 self.policy,
@@ -286,18 +285,23 @@ class Trainer:
         results = {"validation loss": round(loss, 4), "at step": step}
         self.facts["card"] = {**self.facts.get("card", {}), "results": results}
         line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
-        return loss
 
-    def save(self, step: int, stopping: bool = False) -> Path:
+    def save(self, step: int, stopping: bool = False) -> None:
         """Write a checkpoint: the first process does, or all their parts, which training does not
         wait for.
 
         Args:
             stopping: the process may be killed before long: what resuming needs comes first.
         """
+        check: SelfCheck | None = None
+        self.unchecked = None
+        # Shared weights come together only at the end of the run.
+        if self.settings.self_check and (not self.sharded or step == self.settings.steps):
+            with self.ema.applied(), gathered(self.policy):
+                if self.accelerator.is_main_process:
+                    check, self.unchecked = try_self_check(self.policy)
         folder, keep = self.run_info.checkpoints, self.settings.keep
         saved = (self.policy, self.ema, self.optimizer, self.config, keep, self.facts)
-        check = self._self_check(step)
         if self._shard_writer is not None:
             save_shards(self._shard_writer, folder, step, *saved, hurry=stopping, self_check=check)
         else:
@@ -305,43 +309,6 @@ class Trainer:
                 save_checkpoint(folder, step, *saved, self_check=check)
             self.accelerator.wait_for_everyone()
         self.last_checkpoint = folder / checkpoint_name(step)
-        return self.last_checkpoint
-
-    def _self_check(self, step: int) -> SelfCheck | None:
-        """The self-check of the averaged weights, in the first process.
-
-        Weights that are shared among processes come together only at the end of the run.
-        """
-        self.unchecked = None
-        is_first = self.accelerator.is_main_process
-        if not self.settings.self_check:
-            return None
-        if self.sharded and step < self.settings.steps:
-            return None
-        if not (self.sharded or is_first):
-            return None
-        with self.ema.applied(), gathered(self.policy):
-            if not is_first:
-                return None
-            check, self.unchecked = try_self_check(self.policy)
-            return check
-
-    def close(self) -> None:
-        """Wait until the last checkpoint is on disk."""
-        if self._shard_writer is not None:
-            self._shard_writer.close()
-            self._shard_writer = None
-
-    def _due(self, done: int) -> bool:
-        """Whether a window ends after `done` updates, as far as the plan goes; being asked to stop
-        ends one too.
-        """
-        settings = self.settings
-        return (
-            done == settings.steps
-            or done % settings.save_every == 0
-            or done % settings.log_every == 0
-        )
 
     def _log(self, step: int, window: Window, line: ProgressLine, loggers: Loggers) -> None:
         values = window.close(step, self.accelerator.reduce)
@@ -361,10 +328,10 @@ def _prepare(policy: Policy, settings: TrainSettings, device: torch.device) -> N
         UserError: the policy, or this machine, has no such thing.
     """
     if settings.losses:
-        if policy.loss_weights is None:
-            raise UserError(
-                f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out."
-            )
+        require(
+            policy.loss_weights is not None,
+            f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out.",
+        )
         policy.loss_weights = dict(settings.losses)
     if settings.recomputation:
         if not isinstance(policy, Recomputes):
@@ -375,30 +342,17 @@ def _prepare(policy: Policy, settings: TrainSettings, device: torch.device) -> N
         policy.recompute(settings.recomputation)
     if settings.compile:
         missing = missing_compiler(device)
-        if missing is not None:
-            raise UserError(
-                f"train.compile=true needs {missing}: install it, or set train.compile=false."
-            )
+        require(
+            missing is None,
+            f"train.compile=true needs {missing}: install it, or set train.compile=false.",
+        )
         keep_compiled_code()
         policy.compile()
 
 
-@contextmanager
-def _reporting(memory: Memory | None, enabled: bool) -> Iterator[None]:
-    """Let the memory report numbers about its inside while this is open."""
-    if memory is None or not enabled:
-        yield
-        return
-    memory.reporting = True
-    try:
-        yield
-    finally:
-        memory.reporting = False
-
-
 def finish(
     trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine, loggers: Loggers
-) -> dict[str, Any]:
+) -> None:
     """Check the averaged weights open loop, and write `open_loop.png` and `summary.json` into the
     run folder.
 
@@ -413,7 +367,7 @@ def finish(
     if settings.open_loop_chunks:
         result = _check_open_loop(trainer, data, line)
     if not trainer.accelerator.is_main_process:
-        return {}
+        return
     summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
     if result is not None:
         plot_open_loop(result, folder / PLOT, trainer.name)
@@ -430,29 +384,22 @@ def finish(
         " of the run)"
     )
     line.say(f"checkpoint: {trainer.last_checkpoint}")
-    return summary
 
 
 def _check_open_loop(trainer: Trainer, data: SplitData, line: ProgressLine) -> OpenLoop | None:
-    """Compare chunks of the averaged weights with recorded ones, in the first process.
-
-    The others only take part where the weights are shared.
-    """
+    """Compare chunks of the averaged weights with recorded ones, in the first process."""
     samples = data.train if data.val is None else data.val
     if not isinstance(samples, TrainingDataset):
         line.say(
             "no open-loop check: it compares chunks step by step, and these samples are keyframes"
         )
         return None
-    is_first = trainer.accelerator.is_main_process
-    if not (is_first or trainer.sharded):
-        return None
     settings = trainer.settings
     source, episode, _ = samples.locate(0)
     recording = Recording(samples.sources[source], episode, samples.action_offset)
     kind = "training" if data.val is None else "held-out"
     with trainer.ema.applied(), gathered(trainer.policy):
-        if not is_first:
+        if not trainer.accelerator.is_main_process:
             return None
         trainer.policy.eval()
         try:

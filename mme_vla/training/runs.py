@@ -17,6 +17,7 @@ from mme_vla.policy.run_folders import (
     CHECKPOINTS,
     check_output,
     checkpoints_in,
+    find_run,
     newest_checkpoint,
     newest_write,
     resolve_checkpoint,
@@ -126,7 +127,11 @@ def open_run(
         named: whether the user chose `folder`: then `auto` means the run in it, and none beside it.
     """
     if resume in (None, "auto"):
-        check_kind(folder, several=False)
+        require(
+            not any(map(_holds_run, folder.glob("training_*"))),
+            f"{folder} holds trainings of one recipe: add trainings=… to continue them, or choose"
+            " another output.",
+        )
     if resume is None:
         require(
             not _holds_run(folder),
@@ -270,24 +275,6 @@ def _named_sources(config: dict[str, Any], began_with: Collection[str]) -> dict[
     return {**config, "data": {**data, "sources": sources}}
 
 
-def check_kind(folder: Path, several: bool) -> None:
-    """Refuse a single run's folder for several trainings, and the reverse: where both are in one
-    folder, commands take different policies from it.
-    """
-    if several:
-        require(
-            not _holds_run(folder),
-            f"{folder} holds a single run: leave trainings=… out to continue it with"
-            f" resume={folder}, or choose another output.",
-        )
-    else:
-        require(
-            not any(map(_holds_run, folder.glob("training_*"))),
-            f"{folder} holds trainings of one recipe: add trainings=… to continue them, or choose"
-            " another output.",
-        )
-
-
 def _holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
 
@@ -303,14 +290,29 @@ def _unfinished_beside(folder: Path) -> Path | None:
     return checkpoints_in(newest / CHECKPOINTS)[-1]
 
 
-def unfinished_trainings(folder: Path, count: int) -> Path:
-    """`folder`, or the newest folder beside it that holds trainings of which fewer than `count` are
-    finished.
+def open_trainings(folder: Path, resume: str | None, count: int, named: bool) -> Path:
+    """Decide where several trainings of one recipe lie, as `open_run` does for a single one.
+
+    Args:
+        folder: of new ones. With `auto`, unless the user named it, the newest folder beside it that
+            holds trainings of which fewer than `count` are finished comes first.
     """
-    beside = [path for path in folder.parent.glob("*") if trainings_in(path)]
-    newest = max(beside, key=newest_write, default=folder)
-    finished = [run for run in trainings_in(newest) if (run / SUMMARY).is_file()]
-    return newest if len(finished) < count else folder
+    if resume == "auto" and not named:
+        beside = [path for path in folder.parent.glob("*") if trainings_in(path)]
+        newest = max(beside, key=newest_write, default=folder)
+        finished = [run for run in trainings_in(newest) if (run / SUMMARY).is_file()]
+        if len(finished) < count:
+            folder = newest
+    elif resume not in (None, "auto"):
+        folder = find_run(Path(resume))
+        require(folder.is_dir(), f"resume={resume}: there is no such folder of trainings.")
+    # Where a single run and several are in one folder, commands take different policies from it.
+    require(
+        not _holds_run(folder),
+        f"{folder} holds a single run: leave trainings=… out to continue it with"
+        f" resume={folder}, or choose another output.",
+    )
+    return folder
 
 
 def check_finished(trainings: Sequence[Path]) -> None:

@@ -12,9 +12,8 @@ them reads it again.
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +70,7 @@ class ShardWriter:
         writer = dcp.HuggingFaceStorageWriter(str(draft / SHARDS), save_distributed=True)
         pinned = torch.cuda.is_available()
         stager = DefaultStager(StagingOptions(pinned, False, False, pinned))
-        with _quiet():
+        with warnings.catch_warnings(action="ignore"):  # on what PyTorch calls experimental
             parts = dcp.async_save(
                 dict(tensors), storage_writer=writer, process_group=self._group, async_stager=stager
             )
@@ -211,7 +210,8 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
         " of it is missing.",
     )
     try:
-        with _quiet():
+        # Without warnings on what is experimental, or assumed of a process that is alone.
+        with warnings.catch_warnings(action="ignore"):
             dcp.load(tensors, storage_reader=reader, no_dist=alone)
     except CheckpointException as error:  # what the processes met with, by their numbers
         with decoding(folder, "shards of a checkpoint", _REMEDY):
@@ -220,13 +220,3 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     for name, tensor in tensors.items():
         local[name] = tensor.to_local() if isinstance(tensor, DTensor) else tensor
     check_values(local, str(folder))
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without PyTorch's warnings on what it calls experimental, or assumes of a process that is
-    alone.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield

@@ -192,9 +192,9 @@ def test_foreign_folders_are_neither_read_nor_cleared(source, tmp_path) -> None:
 
 
 def test_an_estimate_counts_frames_and_bytes_and_saves_nothing(source, tmp_path) -> None:
-    plan = estimate(source, LastFrames(keep_every=4), encode, "bfloat16")
+    frames, n_bytes, seconds = estimate(source, LastFrames(keep_every=4), encode, "bfloat16")
     n_frames = 8 + 5 + 3  # frame 0 and 3, 7, … of 30, 17 and 8
-    assert (plan.frames, plan.bytes) == (n_frames, n_frames * 4 * WIDTH * 2) and plan.seconds > 0
+    assert (frames, n_bytes) == (n_frames, n_frames * 4 * WIDTH * 2) and seconds > 0
 
 
 def test_an_encoder_of_another_grid_is_noticed(source, tmp_path) -> None:

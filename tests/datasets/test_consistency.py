@@ -32,7 +32,7 @@ from helpers.lerobot_tables import (
     write_dataset,
     write_video,
 )
-from mme_vla.data.episode_table import EpisodeTable
+from mme_vla.data.episode_table import Description
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import (
     SAMPLE,
@@ -253,8 +253,9 @@ def test_rounded_time_stamps_of_long_episodes_are_in_order(tmp_path: Path, fps: 
     from mme_vla.data import consistency
 
     frames = np.arange(3 * 3600 * int(fps))  # three hours in float32
-    episodes = EpisodeTable(np.array([0]), np.array([len(frames)]), [()], None, {})
-    dataset = consistency.Description(tmp_path, Info(features={}, fps=fps), episodes, (), ())
+    lengths = np.array([len(frames)])
+    info = Info(features={}, fps=fps)
+    dataset = Description(tmp_path, info, np.array([0]), lengths, [()], None, {}, ())
     rows = {"episode_index": np.zeros_like(frames)}
     rows["timestamp"] = np.float32(frames / fps).astype(np.float64)
     consistency._check_rows(dataset, rows)

@@ -73,9 +73,7 @@ def finish_run(job: Trainer, line: ProgressLine | None = None) -> bool:
     first, run = job.accelerator.is_main_process, job.run_info
     loggers = open_loggers(run.folder, {}, run.step) if first else Loggers()
     with line or ProgressLine(job.settings.steps, 0, visible=False) as progress:
-        finished = job.run(progress, loggers)
-        job.close()
-    return finished
+        return job.run(progress, loggers)
 
 
 def validation_losses(job: Trainer) -> dict[str, float]:

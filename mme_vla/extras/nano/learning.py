@@ -4,7 +4,7 @@ beforehand.
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -37,8 +37,8 @@ from mme_vla.types import Batch, HistoryTokens, labels_read
 
 # of an action's number, in metres or radians: less than that is jitter, and is not blown up
 NARROWEST = 0.1
-FrameLabels = Mapping[str, Callable[[np.ndarray], np.ndarray]]
-"""Name of a label → its values [n] at frames [n]."""
+FrameLabels = Mapping[str, np.ndarray]
+"""Name of a label → its values [t] at all frames."""
 JOINT_NOISE = 0.05
 VIEW_NOISE = 0.25  # on tokens of current images: what points at an object reads its place there
 MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to another place
@@ -464,12 +464,13 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
 
 def _labels(memory: Memory, demonstration: Demonstration) -> FrameLabels:
     """The labels of sub-tasks and facts that a memory reads."""
+    frames = np.arange(demonstration.length)
 
-    def count(begins: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda frames: np.searchsorted(begins, frames, side="right").astype(np.float32)
+    def count(begins: np.ndarray) -> np.ndarray:
+        return np.searchsorted(begins, frames, side="right").astype(np.float32)
 
-    def is_in(labelled: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda frames: np.isin(frames, labelled).astype(np.float32)
+    def is_in(labelled: np.ndarray) -> np.ndarray:
+        return np.isin(frames, labelled).astype(np.float32)
 
     begins = demonstration.boundaries
     known = {SUBTASK: count(begins), BOUNDARY: is_in(begins)}
