@@ -184,7 +184,7 @@ def open_both(inspection: Inspection) -> tuple[Policy, str, EpisodeSource, Path]
 
 
 @torch.no_grad()
-def draw_policy_memory(inspection: Inspection, console: Console) -> Path:
+def draw_policy_memory(inspection: Inspection, console: Console) -> None:
     """Draw what the memory of `checkpoint` selects at `step` of an episode of `dataset`."""
     episode = inspection.episode
     if episode is None:
@@ -204,7 +204,6 @@ def draw_policy_memory(inspection: Inspection, console: Console) -> Path:
         source, episode, step, memory, name, Path(inspection.output), console, history
     )
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
-    return image
 
 
 def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
@@ -401,10 +400,10 @@ def check_place(source: EpisodeSource, episode: int, step: int | None) -> tuple[
     check_episode(source, episode)
     length = int(source.lengths[episode])
     step = length - 1 if step is None else step
-    if not 0 <= step < length:
-        raise UserError(
-            f"step={step}: episode {episode} of {source.name} has frames 0 … {length - 1}."
-        )
+    require(
+        0 <= step < length,
+        f"step={step}: episode {episode} of {source.name} has frames 0 … {length - 1}.",
+    )
     return episode, step
 
 

@@ -94,7 +94,7 @@ def train_several(run: TrainRun, folder: Path, named: bool) -> None:
         existing = open_run(place, "auto", one.config, named=True)
         is_finished = (place / SUMMARY).is_file() and existing.step == one.train.steps
         line = f"training {number + 1} of {run.trainings}, seed {one.seed}, in {place}"
-        if is_finished and existing.checkpoint is not None:
+        if is_finished:
             print(f"{line}: finished")
             continue
         print(line)
@@ -186,13 +186,20 @@ def _train(
     config = config_of(run, place)
     digests = {"content": data.content, "side_files": data.side_files}
     saved_config = {**config, "data": {**config["data"], **digests}}
+    collate = policy.require_processor().collate
+    validation = None
+    if data.val is not None and run.train.val_samples:
+        piece = run.train.batch_size // (run.train.accumulate * accelerator.num_processes)
+        validation = Validation(
+            data.val, collate, run.train.val_samples, max(piece, 1), run.train.seed
+        )
     settings = config["train"].items()
     recipe = {key: value for key, value in settings if not isinstance(value, dict)}
     trainer = Trainer(
         policy,
         data.train,
-        policy.require_processor().collate,
-        held_out(policy, data, run, accelerator),
+        collate,
+        validation,
         run.train,
         place,
         saved_config,
@@ -306,22 +313,6 @@ def running_words(*left_out: str) -> list[str]:
         if not word.startswith(left_out):
             words.append(word)
     return words
-
-
-def held_out(
-    policy: Policy, data: SplitData, run: TrainRun, accelerator: Accelerator
-) -> Validation | None:
-    """The held-out samples that are measured while training, if any."""
-    if data.val is None or not run.train.val_samples:
-        return None
-    batch_size = run.train.batch_size // (run.train.accumulate * accelerator.num_processes)
-    return Validation(
-        data.val,
-        policy.require_processor().collate,
-        run.train.val_samples,
-        max(batch_size, 1),
-        run.train.seed,
-    )
 
 
 def config_of(run: TrainRun, place: Run) -> dict[str, Any]:

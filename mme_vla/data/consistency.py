@@ -99,11 +99,11 @@ def _check_totals(dataset: Description) -> None:
         ("total_frames", dataset.info.total_frames, lengths.sum(), "frames"),
     )
     for key, declared, count, what in totals:
-        if declared is not None and declared != count:
-            raise UserError(
-                f"{dataset.root}/meta/info.json: {key} is {brief(declared)}, but meta/episodes"
-                f" describes {count} {what}. {CORRECT}"
-            )
+        require(
+            declared is None or declared == count,
+            f"{dataset.root}/meta/info.json: {key} is {brief(declared)}, but meta/episodes"
+            f" describes {count} {what}. {CORRECT}",
+        )
     listed = dataset.declared_lengths
     if listed is None:
         return
@@ -178,10 +178,10 @@ def _read_starts(dataset: Description, rows: Mapping[str, np.ndarray]) -> np.nda
         exec_starts = np.add.reduceat(rows["is_demo"], dataset.starts)
         other = "is_demo marks the first {} frames of the episode as its conditioning video"
         frames = np.arange(len(rows["is_demo"])) - np.repeat(dataset.starts, dataset.lengths)
-        if ((frames < np.repeat(exec_starts, dataset.lengths)) != rows["is_demo"]).any():
-            raise UserError(
-                f"{dataset.root}: is_demo must be true for an episode's first frames only."
-            )
+        require(
+            ((frames < np.repeat(exec_starts, dataset.lengths)) == rows["is_demo"]).all(),
+            f"{dataset.root}: is_demo must be true for an episode's first frames only.",
+        )
     if exec_starts is not None and "exec_start_idx" in rows:
         expected = np.repeat(exec_starts, dataset.lengths)
         row = first_wrong(rows["exec_start_idx"] != expected)

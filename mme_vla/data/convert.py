@@ -9,8 +9,7 @@ ones.
 
 import json
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -44,26 +43,13 @@ from mme_vla.utils import (
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
 
 
-@contextmanager
-def episodes_without_statistics() -> Iterator[None]:
-    """While this lasts, LeRobot reads a dataset's list of episodes at once, and without their
-    statistics.
+def _episodes_without_statistics(root: Path) -> dict[str, list[Any]]:
+    """The list of a dataset's episodes at once, and without their statistics.
 
-    It asks the `datasets` library, whose time grows with the square of the number of columns: of a
-    dozen features that are two hundred, nearly all of them statistics, and a fifth of a second for
-    every episode that is merged.
+    LeRobot asks the `datasets` library, whose time grows with the square of the number of columns:
+    of a dozen features that are two hundred, nearly all of them statistics, and a fifth of a second
+    for every episode that is merged.
     """
-    from lerobot.datasets import dataset_metadata
-
-    original = dataset_metadata.load_episodes
-    dataset_metadata.load_episodes = _columns
-    try:
-        yield
-    finally:
-        dataset_metadata.load_episodes = original
-
-
-def _columns(root: Path) -> dict[str, list[Any]]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -149,11 +135,11 @@ class ConvertOptions:
         require(
             self.images in ("video", "png"), f"images={self.images!r}: expected 'video' or 'png'."
         )
-        if self.names not in NAMES:
-            raise UserError(
-                f"names={self.names!r} is no spelling of columns."
-                f" {did_you_mean(str(self.names), NAMES)}"
-            )
+        require(
+            self.names in NAMES,
+            f"names={self.names!r} is no spelling of columns."
+            f" {did_you_mean(str(self.names), NAMES)}",
+        )
         require(
             self.fps >= 1 and self.gop >= 1,
             f"fps={self.fps} and video.gop={self.gop} must be positive.",
@@ -406,10 +392,15 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
 
 
 def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
+    from lerobot.datasets import dataset_metadata
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    with episodes_without_statistics():
+    original = dataset_metadata.load_episodes
+    dataset_metadata.load_episodes = _episodes_without_statistics
+    try:
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
+    finally:
+        dataset_metadata.load_episodes = original
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
     # LeRobot writes its keys in the order of a set, another in each process

@@ -68,7 +68,6 @@ class EpisodeSource:
         root: str | Path,
         exec_starts: str | Path | None = None,
         name: str | None = None,
-        max_open_videos: int = 512,
         robot: Embodiment = ROBOMME_JOINT,
     ) -> None:
         """Open a dataset and compare it with itself (`consistency`); nothing is downloaded.
@@ -79,7 +78,6 @@ class EpisodeSource:
                 datasets that do not mark their conditioning video.
             name: short name, which the validation split and the cache folder use; by default the
                 folder's.
-            max_open_videos: most video files kept open.
             robot: says which columns hold its images, states and actions.
 
         Raises:
@@ -134,7 +132,7 @@ class EpisodeSource:
         self._description = read_description(self.root, info, videos, images)
         self.starts = self._description.starts
         self.lengths = self._description.lengths
-        self._reader = VideoReader(max_open_videos)
+        self._reader = VideoReader()
         self._motions: dict[int, Motions] = {}
         rendered = {camera: f"{camera}{RENDERED_SUFFIX}" for camera in self.columns}
         flags = ["is_demo", "exec_start_idx", *rendered.values()]

@@ -151,11 +151,11 @@ class RawEpisode:
         )
         demo = np.array([self._flag(k, "info/is_video_demo") for k in range(self.length)])
         self.exec_start = int(demo.sum())
-        if demo[self.exec_start :].any() or self.exec_start == self.length:
-            raise UserError(
-                f"{ref.file} {ref.group}: video frames must come first, then at least one execution"
-                " frame."
-            )
+        require(
+            self.exec_start < self.length and not demo[self.exec_start :].any(),
+            f"{ref.file} {ref.group}: video frames must come first, then at least one execution"
+            " frame.",
+        )
 
     def _value(self, name: str) -> Any:
         with decoding(self._path(name), "a dataset of HDF5", REMEDY):
@@ -255,9 +255,6 @@ class RawEpisode:
     @property
     def difficulty(self) -> str | None:
         return self._text("setup/difficulty") if "setup/difficulty" in self._group else None
-
-    def __len__(self) -> int:
-        return self.length
 
     @cached_property
     def frames(self) -> dict[str, Any] | None:
@@ -510,8 +507,7 @@ def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
     with _open(ref.file) as handle:
         with decoding(ref.file, "HDF5", REMEDY):
             group = handle.get(ref.group)
-        if group is None:
-            raise UserError(f"{ref.file} has no {ref.group}.")
+        require(group is not None, f"{ref.file} has no {ref.group}.")
         yield RawEpisode(ref, group)
 
 

@@ -60,7 +60,7 @@ def memory_sheet(
     columns = max(min(COLUMNS, len(tiles)), 6)
     header = Image.new("RGB", (columns * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL), GROUND)
     draw = ImageDraw.Draw(header)
-    _timeline(draw, counts, grid**2, exec_start, step, (0, 0, header.width, TIMELINE))
+    _timeline(draw, counts, grid**2, exec_start, step, header.width)
     hidden = len(remembered) - len(displayed)
     note = "In colour: remembered patches. Dimmed: the rest of those frames."
     if hidden:
@@ -101,24 +101,23 @@ def _timeline(
     full: int,
     exec_start: int,
     step: int,
-    box: tuple[int, int, int, int],
+    width: int,
 ) -> None:
     """Bars of the tokens remembered of each frame, over video and execution."""
-    left, top, right, height = box
-    bottom = top + height - LABEL
-    scale = (right - left) / max(len(counts), 1)
-    split = left + exec_start * scale
-    for begin, end, colour in ((left, split, VIDEO), (split, right, EXECUTION)):
+    bottom = TIMELINE - LABEL
+    scale = width / max(len(counts), 1)
+    split = exec_start * scale
+    for begin, end, colour in ((0, split, VIDEO), (split, width, EXECUTION)):
         if end > begin:
             pale = tuple(g + (c - g) // 5 for g, c in zip(GROUND, colour, strict=True))
-            draw.rectangle((begin, top, end, bottom), fill=pale)
+            draw.rectangle((begin, 0, end, bottom), fill=pale)
     for frame in np.flatnonzero(counts):
-        x = left + frame * scale
-        y = bottom - max(3, counts[frame] / full * (bottom - top))
+        x = frame * scale
+        y = bottom - max(3, counts[frame] / full * bottom)
         colour = VIDEO if frame < exec_start else EXECUTION
         draw.rectangle((x, y, x + max(scale, 2), bottom), fill=colour)
-    draw.line((left, bottom, right, bottom), fill=INK)
+    draw.line((0, bottom, width, bottom), fill=INK)
     phases = {0: "0 · conditioning video", exec_start: f"{exec_start} · execution", step: str(step)}
     for frame, text in phases.items():
-        x = min(left + frame * scale, right - draw.textlength(text, font(13)))
+        x = min(frame * scale, width - draw.textlength(text, font(13)))
         draw.text((x, bottom + 3), text, INK, font(13))

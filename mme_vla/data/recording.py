@@ -7,11 +7,8 @@ import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import brief, require
-from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
 from mme_vla.policy.sections import PolicySections
-
-SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
 
 
 @dataclass(frozen=True)
@@ -36,14 +33,6 @@ class Recording:
         return int(self.source.exec_starts[self.episode])
 
     @property
-    def task(self) -> str:
-        return self.source.task(self.episode)
-
-    @property
-    def goal(self) -> str:
-        return self.source.goal(self.episode)
-
-    @property
     def name(self) -> str:
         return f"{self.source.name}/{self.episode}"
 
@@ -52,26 +41,6 @@ class Recording:
         """Which episode of which dataset, and its goal."""
         goals = " → ".join(self.source.goals(self.episode))
         return f"episode {self.episode} of {self.source.name}: “{goals}”"
-
-    @property
-    def tells_subtasks(self) -> bool:
-        return SUBGOAL in self.source.subgoal_names
-
-    def subgoal(self, step: int, column: str = SUBGOAL) -> str | None:
-        """The subgoal at a step; None where the dataset has no such column."""
-        return self.source.subgoals(self.episode, step).get(column)
-
-    def frame(self, number: int) -> np.ndarray:
-        """An image [H, W, 3] uint8 of the camera that feeds memory."""
-        return self.source.frames(self.episode, [number])[0]
-
-    def boundaries(self) -> list[int]:
-        """Frames at which a sub-task begins, the execution's first among them."""
-        if not self.tells_subtasks:
-            return [self.exec_start]
-        subgoals = [self.subgoal(step) for step in range(self.length)]
-        changes = [step for step in range(1, self.length) if subgoals[step] != subgoals[step - 1]]
-        return sorted({0, self.exec_start, *changes})
 
     def decisions(self, stride: int, most: int | None) -> list[int]:
         """Steps at which chunks are chosen: every `stride`-th at which the robot decides, `most` of
@@ -158,19 +127,3 @@ def action_offset_of(policy: Policy) -> int:
         f"The policy's configuration has data.action_offset={brief(offset)}; expected 0 or 1.",
     )
     return int(offset)
-
-
-def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
-    """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for
-    all.
-    """
-    memory = policy.memory
-    if memory is None or memory.past_view_spec is not None:
-        return None
-    if policy.frames_read(np.zeros(1, np.int64), 0) is None:
-        return None
-    frames = [memory.storage.stored_frames(length)]
-    scorer = memory.make_scorer()
-    if scorer is not None:
-        frames.append(scorer.frames_scored(length))
-    return union_frames(frames)

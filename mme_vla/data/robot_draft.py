@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.lerobot_files import Feature, Info, names_of
-from mme_vla.errors import UserError, listed, printable
+from mme_vla.errors import listed, printable, require
 
 CHECK = "check:"
 """Begins the comments of lines that a dataset cannot tell."""
@@ -60,13 +60,13 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
     action = _vectors(info.features, ("action", "actions"), "action")
     needed = {"a camera": cameras, "a state": state, "an action": action}
     absent = [part for part, columns in needed.items() if not columns]
-    if absent:
-        raise UserError(
-            f"{root} has no column of {' and none of '.join(absent)}, and a policy needs all three:"
-            f" observation.images.<camera>, observation.state and action. It has"
-            f" {listed(info.features)}. Name others in a file of your own, which"
-            " docs/extend/your-robot.md explains, or record them."
-        )
+    require(
+        not absent,
+        f"{root} has no column of {' and none of '.join(absent)}, and a policy needs all three:"
+        f" observation.images.<camera>, observation.state and action. It has"
+        f" {listed(info.features)}. Name others in a file of your own, which"
+        " docs/extend/your-robot.md explains, or record them.",
+    )
     state_features = [info.features[column] for column in state]
     action_features = [info.features[column] for column in action]
     state_width = sum(feature.width for feature in state_features)

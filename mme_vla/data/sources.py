@@ -16,7 +16,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.action_space import compare_names
-from mme_vla.errors import UserError, listed, require
+from mme_vla.errors import listed, require
 
 log = logging.getLogger(__name__)
 
@@ -64,10 +64,10 @@ def split_episodes(
         episodes = np.arange(len(source))
         split.train.append(episodes[~held_out])
         split.val.append(episodes[held_out])
-    if not sum(map(len, split.train)):
-        raise UserError(
-            "The split leaves no episode to train on; lower val_fraction or shorten val_episodes."
-        )
+    require(
+        any(map(len, split.train)),
+        "The split leaves no episode to train on; lower val_fraction or shorten val_episodes.",
+    )
     return split
 
 
@@ -150,11 +150,10 @@ def open_sources(
     for entry in listed_sources(entries):
         sources.append(EpisodeSource(entry.root, entry.exec_starts, entry.name, robot=robot))
     names = [source.name for source in sources]
-    if len(set(names)) < len(names):
-        raise UserError(
-            f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its"
-            " own."
-        )
+    require(
+        len(set(names)) == len(names),
+        f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its own.",
+    )
     # They are trained on together. Other rates are a warning: they may be meant.
     first = sources[0]
     for second in sources[1:]:

@@ -150,7 +150,6 @@ def check_ranges(
         UserError: a range is too narrow, and `narrow` is `refuse`. It names the number, its range
             and its extremes.
     """
-    check_choice("narrow", narrow, NARROW)
     if narrow == "ignore":
         return stats
     state, actions = _extremes(sources, episodes, horizon, action_offset, robot, video)

@@ -36,7 +36,6 @@ class VideoReader:
         self.max_open = max_open
         self._open: OrderedDict[Path, Any] = OrderedDict()
         self._process = os.getpid()
-        self._may_hold: int | None = None
 
     def read(self, path: Path, timestamps: Sequence[float] | np.ndarray, fps: float) -> np.ndarray:
         """Return the images nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order
@@ -108,15 +107,13 @@ class VideoReader:
             # open files of a parent process share their position with it
             self._open = OrderedDict()
             self._process = os.getpid()
-            self._may_hold = None
         if path not in self._open:
             container = av.open(str(path))
             # parallelism is across workers
             container.streams.video[0].codec_context.thread_count = 1
             self._open[path] = container
-            if self._may_hold is None:
-                self._may_hold = files_to_hold(self.max_open)
-            while len(self._open) > self._may_hold:
+            most = files_to_hold(self.max_open)
+            while len(self._open) > most:
                 self._open.popitem(last=False)[1].close()
         self._open.move_to_end(path)
         return self._open[path]

@@ -107,11 +107,11 @@ def row_of(text: str, options: Sequence[Mapping[str, Any]] | None = None) -> np.
         is_valid = point.shape in ((0,), (2,)) and bool(((point >= 0) & (point <= SIDE)).all())
     except (UserError, ValueError, TypeError, KeyError, AttributeError):
         is_valid = False
-    if not is_valid or letter not in ("", *LETTERS):
-        raise UserError(
-            f'{brief(text)} is no choice; expected {{"choice": "A", "point": [y, x]}}, letters A'
-            f" to H and pixels to {SIDE}."
-        )
+    require(
+        is_valid and letter in ("", *LETTERS),
+        f'{brief(text)} is no choice; expected {{"choice": "A", "point": [y, x]}}, letters A to H'
+        f" and pixels to {SIDE}.",
+    )
     if not letter:
         return None
     if options is not None:

@@ -235,19 +235,19 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     state: dict[str, Any] = read_json(
         checked_file(checkpoint, STATE), "a training state", limit=2**24
     )
-    if state.get("format") != FORMAT:
-        raise UserError(
-            f"{path} was not written by this library's training (format {FORMAT!r} expected)."
-        )
+    require(
+        state.get("format") == FORMAT,
+        f"{path} was not written by this library's training (format {FORMAT!r} expected).",
+    )
     section_keys(state, str(path), _STATE_KEYS)
     step = state.get("step")
     is_step = type(step) is int and 0 <= step < 2**53
     has_sections = isinstance(state.get("config"), dict) and isinstance(state.get("versions"), dict)
-    if not is_step or not has_sections:
-        raise UserError(
-            f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older"
-            " one."
-        )
+    require(
+        is_step and has_sections,
+        f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older"
+        " one.",
+    )
     require(
         step_of(checkpoint) in (step, -1),
         f"{path} has step {step}, but its folder is called {checkpoint.name}. Give the folder the"
@@ -261,10 +261,10 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
         " checkpoint.",
     )
     for name in (RAW, OPTIMIZER):
-        if not shards and not (checkpoint / name).is_file():
-            raise UserError(
-                f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint."
-            )
+        require(
+            shards or (checkpoint / name).is_file(),
+            f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint.",
+        )
     return state
 
 

@@ -277,12 +277,9 @@ def check_logger(section: Mapping[str, Any] | None) -> None:
     name = (section or {}).get("name")
     if name not in ("wandb", "trackio", "mlflow"):
         return
-    try:
-        is_installed = find_spec(name) is not None
-    except ValueError:  # a module without a specification
-        is_installed = False
-    if is_installed:
-        return
+    with suppress(ValueError):  # a module without a specification
+        if find_spec(name) is not None:
+            return
     if name == "wandb":
         raise missing_extra("logger=wandb", "wandb")
     pins = "-c constraints.txt " if CONSTRAINTS.is_file() else ""

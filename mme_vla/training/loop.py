@@ -372,9 +372,18 @@ def finish(
     if result is not None:
         plot_open_loop(result, folder / PLOT, trainer.name)
         loggers.log_image(settings.steps, "open_loop", folder / PLOT)
-        summary["open_loop"] = result.summary()
-        line.say("\n".join([f"open loop on {result.title}", *error_lines(summary["open_loop"])]))
-        line.say(advice(summary["open_loop"], settings.steps))
+        errors = result.summary()
+        summary["open_loop"] = errors
+        line.say("\n".join([f"open loop on {result.title}", *error_lines(errors)]))
+        advice = errors["verdict"]
+        best = errors["baselines_normalised"][errors["best_baseline"]]
+        is_better = sum(errors["mean_abs_error_normalised"]) < sum(best)
+        if not is_better:
+            advice += (
+                f" {settings.steps:,} updates on this data are too few for a policy. They show that"
+                " everything runs; raise train.steps, or train on more data, before evaluating."
+            )
+        line.say(advice)
         line.say(f"plot: {folder / PLOT}")
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
     with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
@@ -416,25 +425,8 @@ def _check_open_loop(trainer: Trainer, data: SplitData, line: ProgressLine) -> O
             return None
 
 
-def advice(summary: Mapping[str, Any], steps: int) -> str:
-    """The verdict of an open-loop check, and what to do about a bad one.
-
-    Args:
-        summary: of `OpenLoop.summary`.
-        steps: updates of the run.
-    """
-    verdict: str = summary["verdict"]
-    best = summary["baselines_normalised"][summary["best_baseline"]]
-    if sum(summary["mean_abs_error_normalised"]) < sum(best):
-        return verdict
-    return (
-        f"{verdict} {steps:,} updates on this data are too few for a policy. They show that"
-        " everything runs; raise train.steps, or train on more data, before evaluating."
-    )
-
-
-def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict[str, float]:
-    """The mean training loss over the first and over the last `share` of a run, and the last
+def loss_change(lines: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The mean training loss over the first and over the last twentieth of a run, and the last
     validation loss.
 
     Args:
@@ -453,8 +445,8 @@ def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict
         weighted = sum((end - begun) * loss for begun, end, loss in entries)
         return weighted / sum(end - begun for begun, end, _ in entries)
 
-    first = [span for span in spans if span[0] < max(share * total, 1)]
-    last = [span for span in spans if span[1] > min((1 - share) * total, total - 1)]
+    first = [span for span in spans if span[0] < max(0.05 * total, 1)]
+    last = [span for span in spans if span[1] > min(0.95 * total, total - 1)]
     change = {"first_loss": mean(first), "last_loss": mean(last)}
     held_out = [line["val/loss"] for line in lines if "val/loss" in line]
     if held_out:

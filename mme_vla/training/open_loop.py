@@ -191,7 +191,7 @@ def open_loop(
         # An episode may have several tasks, one after the other.
         episode.goal = source.goal(number, step)
         if subgoal is not None:
-            episode.subgoal = recording.subgoal(step, subgoal)
+            episode.subgoal = source.subgoals(number, step)[subgoal]
         with torch.no_grad():
             chunk = policy.act(episode)
         actions, is_known = source.action_chunk(number, step, len(chunk), recording.action_offset)

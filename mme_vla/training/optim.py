@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from mme_vla.backbone.base import FineTuneSpec
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import did_you_mean, require
 from mme_vla.training.parallel import like
 from mme_vla.training.settings import TrainSettings
 
@@ -46,8 +46,10 @@ def lr_factors(names: Iterable[str], spec: FineTuneSpec, settings: TrainSettings
     factors = settings.part_lr or {}
     parts = [spec.component_of(name) for name in names]
     for part in factors:
-        if part not in spec.components:
-            raise UserError(f"train.part_lr names {part!r}. {did_you_mean(part, spec.components)}")
+        require(
+            part in spec.components,
+            f"train.part_lr names {part!r}. {did_you_mean(part, spec.components)}",
+        )
         if part not in parts:
             warnings.warn(
                 f"train.part_lr.{part} has no effect: no weight of {part} is trained.",

@@ -112,12 +112,10 @@ def readers(workers: int, batch_bytes: int, most: float) -> tuple[int, int]:
     """How many workers read, and how many batches each of them reads ahead, within `most` bytes.
 
     Args:
-        workers: as many as may be; at least one of them reads one batch ahead, whatever its size.
+        workers: as many as may be, at least one, which reads one batch ahead whatever its size.
     """
     fitting = max(int(most // max(batch_bytes, 1)), 1)
     workers = min(workers, fitting)
-    if not workers:
-        return 0, 0
     return workers, min(fitting // workers, MOST_AHEAD)
 
 

@@ -143,7 +143,15 @@ def open_run(
         checkpoints = checkpoints_in(folder / CHECKPOINTS)
         newest = checkpoints[-1] if checkpoints else None
         if not checkpoints and not named:
-            newest = _unfinished_beside(folder)
+            # The last checkpoint of the run beside it that wrote last, unless that one is finished.
+            beside = [
+                path for path in folder.parent.glob("*") if checkpoints_in(path / CHECKPOINTS)
+            ]
+            latest = max(
+                beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, default=None
+            )
+            if latest is not None and not (latest / SUMMARY).is_file():
+                newest = checkpoints_in(latest / CHECKPOINTS)[-1]
         if newest is None:
             return Run(folder)
         try:
@@ -279,17 +287,6 @@ def _holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
 
 
-def _unfinished_beside(folder: Path) -> Path | None:
-    """The last checkpoint of the run beside `folder` that wrote last, unless that run is
-    finished.
-    """
-    beside = [path for path in folder.parent.glob("*") if checkpoints_in(path / CHECKPOINTS)]
-    newest = max(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, default=None)
-    if newest is None or (newest / SUMMARY).is_file():
-        return None
-    return checkpoints_in(newest / CHECKPOINTS)[-1]
-
-
 def open_trainings(folder: Path, resume: str | None, count: int, named: bool) -> Path:
     """Decide where several trainings of one recipe lie, as `open_run` does for a single one.
 
@@ -328,13 +325,10 @@ def check_finished(trainings: Sequence[Path]) -> None:
     )
 
 
-ASK = "ask"
-
-
 def weights_to_start_from(init_from: str | None) -> str | None:
     """What `init_from` names; None for random weights."""
     require(
-        init_from != ASK,
+        init_from != "ask",
         "This recipe starts from trained weights: give init_from=<checkpoint> "
         "(docs/train/weights.md lists the formats). "
         "To train the whole network from random weights, say so: init_from=none.",

@@ -6,7 +6,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -28,33 +28,48 @@ class StopRequest:
     """
 
     group: Any = None
-    event: threading.Event = field(default_factory=threading.Event)
+    asked: bool = False
+    """Whether this process was."""
     signal: int = signal.SIGTERM
     """Which signal this process was asked by; of processes asked by another one, SIGTERM."""
 
     def __call__(self) -> bool:
-        requested = self.event.is_set()
         if self.group is None:
-            return requested
-        flag = torch.tensor(int(requested))
+            return self.asked
+        flag = torch.tensor(int(self.asked))
         distributed.all_reduce(flag, distributed.ReduceOp.MAX, self.group)
         return bool(flag)
 
 
 @contextmanager
 def stop_requests() -> Iterator[StopRequest]:
-    """While this is open, Ctrl-C and SIGTERM only ask; a second one ends the process as usual."""
+    """While this is open, Ctrl-C and SIGTERM only ask; a second one ends the process as usual.
+
+    Only a main thread may answer signals: in any other they do what they always do.
+    """
     request = StopRequest()
-    with _signals_set(request):
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.getsignal(number) for number in ANSWERED}
+
+    def ask(number: int, frame: Any) -> None:
+        request.signal = number
+        request.asked = True
+        signal.signal(number, before[signal.Signals(number)])
+
+    for number in before:
+        signal.signal(number, ask)
+    try:
         is_started = distributed.is_available() and distributed.is_initialized()
         if is_started and distributed.get_world_size() > 1:
             # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
             request.group = distributed.new_group(backend="gloo")
-        try:
-            yield request
-        finally:
-            if request.group is not None:
-                distributed.destroy_process_group(request.group)
+        yield request
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if request.group is not None:
+            distributed.destroy_process_group(request.group)
 
 
 def leave_signals_alone(worker: int) -> None:
@@ -66,27 +81,3 @@ def leave_signals_alone(worker: int) -> None:
     for number in ANSWERED:
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-
-
-@contextmanager
-def _signals_set(request: StopRequest) -> Iterator[None]:
-    """Each signal asks, once; only a main thread may answer signals, in any other
-    nothing changes.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in ANSWERED}
-
-    def ask(number: int, frame: Any) -> None:
-        request.signal = number
-        request.event.set()
-        signal.signal(number, before[signal.Signals(number)])
-
-    for number in before:
-        signal.signal(number, ask)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

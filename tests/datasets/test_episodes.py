@@ -19,6 +19,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.data.sources import open_sources
+from mme_vla.data.video import VideoReader
 from mme_vla.errors import UserError
 
 
@@ -77,7 +78,8 @@ def test_action_chunks_repeat_the_last_action(sample: EpisodeSource) -> None:
 def test_open_videos_are_bounded_and_not_shared_with_other_processes(sample: EpisodeSource) -> None:
     import multiprocessing
 
-    source = EpisodeSource("sample", max_open_videos=1)
+    source = EpisodeSource("sample")
+    source._reader = VideoReader(max_open=1)
     expected = source.frames(0, [3, 90])
     source.frames(0, [5], "wrist")
     assert len(source._reader._open) == 1

@@ -27,7 +27,6 @@ def test_reading_ahead_is_bounded_in_bytes() -> None:
     assert readers(8, 400 * 10**6, 8e9) == (8, 2)  # 20 batches fit
     assert readers(8, 10**9, 5e9) == (5, 1)  # fewer read
     assert readers(8, 10**12, 8e9) == (1, 1)  # one batch there must be
-    assert readers(0, 10**6, 8e9) == (0, 0)
 
 
 def test_things_are_made_ahead_and_no_further() -> None:

@@ -32,7 +32,7 @@ def test_episode_fields_are_decoded(tmp_path: Path) -> None:
     path = tmp_path / "record_dataset_Alpha.h5"
     (recorded,) = write_file(path, [12], videos=[5], numbers=[3])
     with open_episode(EpisodeRef(path, 3, "Alpha")) as episode:
-        assert (len(episode), episode.exec_start, episode.seed, episode.difficulty) == (
+        assert (episode.length, episode.exec_start, episode.seed, episode.difficulty) == (
             12,
             5,
             300,
@@ -220,7 +220,7 @@ def test_official_files_are_read(h5_folder: Path) -> None:
                 and frame.front.dtype == np.uint8
             )
             assert frame.state.shape == frame.action.shape == (8,)
-            episodes[ref.task, ref.index] = (len(episode), episode.exec_start, episode.difficulty)
+            episodes[ref.task, ref.index] = (episode.length, episode.exec_start, episode.difficulty)
     assert episodes == {
         ("PatternLock", 8): (148, 74, "easy"),
         ("PickXtimes", 8): (332, 0, "easy"),

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.data.recording import SUBGOAL, stored_frames
 from mme_vla.errors import UserError, require
 from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of
 from mme_vla.extras.probing.channels import (
@@ -23,7 +22,7 @@ from mme_vla.extras.probing.channels import (
     selectable,
 )
 from mme_vla.extras.probing.interventions import Moment
-from mme_vla.extras.probing.recordings import Recording
+from mme_vla.extras.probing.recordings import SUBGOAL, Recording, stored_frames
 from mme_vla.extras.probing.streams import Shown
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode, Failure

@@ -9,10 +9,42 @@ import numpy as np
 from mme_vla.data import recording
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.extras.methods.sam2act.keyframes import EpisodeKeyframes, KeyframeFile
+from mme_vla.memory.base import union_frames
+from mme_vla.policy.base import Policy
+
+SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
 
 
 class Recording(recording.Recording):
-    """One episode of a dataset, with the depth that files beside the dataset hold."""
+    """One episode of a dataset, its sub-tasks, and the depth that files beside the dataset hold."""
+
+    @property
+    def task(self) -> str:
+        return self.source.task(self.episode)
+
+    @property
+    def goal(self) -> str:
+        return self.source.goal(self.episode)
+
+    @property
+    def tells_subtasks(self) -> bool:
+        return SUBGOAL in self.source.subgoal_names
+
+    def subgoal(self, step: int, column: str = SUBGOAL) -> str | None:
+        """The subgoal at a step; None where the dataset has no such column."""
+        return self.source.subgoals(self.episode, step).get(column)
+
+    def frame(self, number: int) -> np.ndarray:
+        """An image [H, W, 3] uint8 of the camera that feeds memory."""
+        return self.source.frames(self.episode, [number])[0]
+
+    def boundaries(self) -> list[int]:
+        """Frames at which a sub-task begins, the execution's first among them."""
+        if not self.tells_subtasks:
+            return [self.exec_start]
+        subgoals = [self.subgoal(step) for step in range(self.length)]
+        changes = [step for step in range(1, self.length) if subgoals[step] != subgoals[step - 1]]
+        return sorted({0, self.exec_start, *changes})
 
     def views(
         self, start: int, stop: int, required: np.ndarray | None
@@ -37,3 +69,19 @@ def all_recordings(sources: Sequence[EpisodeSource], action_offset: int = 0) -> 
         for episode in range(len(source)):
             recordings.append(Recording(source, episode, action_offset))
     return recordings
+
+
+def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
+    """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for
+    all.
+    """
+    memory = policy.memory
+    if memory is None or memory.past_view_spec is not None:
+        return None
+    if policy.frames_read(np.zeros(1, np.int64), 0) is None:
+        return None
+    frames = [memory.storage.stored_frames(length)]
+    scorer = memory.make_scorer()
+    if scorer is not None:
+        frames.append(scorer.frames_scored(length))
+    return union_frames(frames)
