@@ -160,18 +160,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.epoch = 0
         self.transforms = tuple(transforms)
         self._cameras = processor.samples.cameras or processor.embodiment.camera_names
-        # Labels and weights of every row of each source's tables.
-        self._labels = tuple(labels)
-        self._memory_labels = labels_read(memory)
-        self._label_values: list[dict[str, np.ndarray]] = []
-        self._weights: list[np.ndarray] = []
-        for source in sources:
-            values = {}
-            for name in dict.fromkeys((*self._labels, *self._memory_labels)):
-                values[name] = label_column(source, name, "The policy's labels")
-            self._label_values.append(values)
-            if weights is not None:
-                self._weights.append(weight_column(source, weights))
+        self._read_columns(labels, weights)
         # Source and number of each episode, and where its items end.
         if episodes is None:
             episodes = [np.arange(len(source)) for source in sources]
@@ -189,6 +178,20 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         # Those at which the robot decides: all of the execution, or those before a planned motion.
         self.steps = sum(counts)
         require(self.steps, "The data hold no execution step of this robot.")
+
+    def _read_columns(self, labels: Sequence[str], weights: str | None) -> None:
+        """Read the labels and weights of every row of each source's tables."""
+        self._labels = tuple(labels)
+        self._memory_labels = labels_read(self.memory)
+        self._label_values: list[dict[str, np.ndarray]] = []
+        self._weights: list[np.ndarray] = []
+        for source in self.sources:
+            values = {}
+            for name in dict.fromkeys((*self._labels, *self._memory_labels)):
+                values[name] = label_column(source, name, "The policy's labels")
+            self._label_values.append(values)
+            if weights is not None:
+                self._weights.append(weight_column(source, weights))
 
     def __len__(self) -> int:
         return self.steps

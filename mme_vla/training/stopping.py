@@ -28,15 +28,15 @@ class StopRequest:
     """
 
     group: Any = None
-    asked: bool = False
-    """Whether this process was."""
+    requested: bool = False
+    """Whether this process was told to."""
     signal: int = signal.SIGTERM
     """Which signal this process was asked by; of processes asked by another one, SIGTERM."""
 
     def __call__(self) -> bool:
         if self.group is None:
-            return self.asked
-        flag = torch.tensor(int(self.asked))
+            return self.requested
+        flag = torch.tensor(int(self.requested))
         distributed.all_reduce(flag, distributed.ReduceOp.MAX, self.group)
         return bool(flag)
 
@@ -54,7 +54,7 @@ def stop_requests() -> Iterator[StopRequest]:
 
     def ask(number: int, frame: Any) -> None:
         request.signal = number
-        request.asked = True
+        request.requested = True
         signal.signal(number, before[signal.Signals(number)])
 
     for number in before:
