@@ -55,6 +55,18 @@ class Step:
     recorded: np.ndarray
 
 
+@dataclass(frozen=True)
+class ColumnNames:
+    """Columns of a dataset that training reads beside a robot's own.
+
+    labels: of the current frame, that the backbone reads; those of the memory follow from it.
+    weights: the column of sample weights.
+    """
+
+    labels: Sequence[str] = ()
+    weights: str | None = None
+
+
 class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
@@ -76,8 +88,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         mask_padding: bool = False,
         jitter: bool = False,
         subgoal: SubgoalText | None = None,
-        labels: Sequence[str] = (),
-        weights: str | None = None,
+        columns: ColumnNames = ColumnNames(),
         seed: int = 42,
         transforms: Sequence[Perturbation] = (),
     ) -> None:
@@ -98,9 +109,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             jitter: hand the memory a random generator, for memories that vary their selection in
                 training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
-            labels: columns of the current frame that the backbone reads; those of the memory follow
-                from it.
-            weights: the column of sample weights.
+            columns: labels and sample weights.
             seed: of all randomness.
             transforms: of the frames of an episode, before anything reads its past.
         """
@@ -160,7 +169,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.epoch = 0
         self.transforms = tuple(transforms)
         self._cameras = processor.samples.cameras or processor.embodiment.camera_names
-        self._read_columns(labels, weights)
+        self._read_columns(columns)
         # Source and number of each episode, and where its items end.
         if episodes is None:
             episodes = [np.arange(len(source)) for source in sources]
@@ -179,9 +188,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.steps = sum(counts)
         require(self.steps, "The data hold no execution step of this robot.")
 
-    def _read_columns(self, labels: Sequence[str], weights: str | None) -> None:
+    def _read_columns(self, columns: ColumnNames) -> None:
         """Read the labels and weights of every row of each source's tables."""
-        self._labels = tuple(labels)
+        self._labels = tuple(columns.labels)
         self._memory_labels = labels_read(self.memory)
         self._label_values: list[dict[str, np.ndarray]] = []
         self._weights: list[np.ndarray] = []
@@ -190,8 +199,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             for name in dict.fromkeys((*self._labels, *self._memory_labels)):
                 values[name] = label_column(source, name, "The policy's labels")
             self._label_values.append(values)
-            if weights is not None:
-                self._weights.append(weight_column(source, weights))
+            if columns.weights is not None:
+                self._weights.append(weight_column(source, columns.weights))
 
     def __len__(self) -> int:
         return self.steps

@@ -14,7 +14,7 @@ from mme_vla.config.naming import digest
 from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.columns import FACT, FACT_VISIBLE
-from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.dataset import ColumnNames, TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import FACTS, SIDE_FILE, content_fingerprint
 from mme_vla.data.sources import (
@@ -198,8 +198,7 @@ def _samples(
         "mask_padding": data.mask_padding,
         "jitter": data.jitter and not held_out,
         "subgoal": SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text),
-        "labels": labels,
-        "weights": data.weights,
+        "columns": ColumnNames(labels, data.weights),
         "seed": seed,
         "transforms": () if held_out else build_transforms(data.history_transforms),
     }
