@@ -202,7 +202,7 @@ class MemoryModule(nn.Module):
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Do a part of the work of the next `encode` while the robot moves. It must not change any
-        token.
+        token, but for rounding.
 
         Args:
             history, stream: as in `encode`, after it.
