@@ -4,9 +4,9 @@
     history ───────── memory ──────────► tokens ─┴─► integration.inject ──► Injection
     Injection, noise ─ backbone.loss or backbone.sample ──► loss [b, h] or chunk [b, h, a]
 
-Data flows down once. The backbone knows of the integration a hook alone, and neither knows which
-memory made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are
-in other packages.
+Data flows down once. The backbone knows of the integration an `Injection` alone, and neither knows
+which memory made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation
+are in other packages.
 
 From image to loss in the order of the calls, with FrameSamp and Modulator:
 

@@ -29,8 +29,7 @@ class RolloutSettings:
     max_batch: most episodes that act together; 1 makes results independent of timing to the last
         bit.
     encode_chunk: frames of a video encoded at a time, before other episodes may act.
-    retries: how often an episode whose environment failed is tried again before the run continues
-        without it.
+    retries: how often an episode is tried again after an error, once all others have begun.
     timeout_s: seconds after which an environment that does not respond is replaced.
     draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes
         are the same.
