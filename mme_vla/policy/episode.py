@@ -106,8 +106,8 @@ class Episode:
         was made of tokens that the former one conditioned.
         """
         memory = self.policy.memory
-        is_known = self._read_prompt is None or prompt.equal(self._read_prompt)
-        if memory is not None and not is_known:
+        is_unchanged = self._read_prompt is None or prompt.equal(self._read_prompt)
+        if memory is not None and not is_unchanged:
             self.stream = memory.start_stream()
         self._read_prompt = prompt
 

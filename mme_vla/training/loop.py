@@ -1,6 +1,7 @@
 """The training loop: update, average, log, validate, save."""
 
 import json
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -218,7 +219,8 @@ class Trainer:
                         if self.unchecked is not None:
                             line.say(f"no self-check in the checkpoint: {self.unchecked}")
                 if stopping:
-                    self.stopped_by = stop.signal
+                    # Where another process was asked, as a cluster ends a job.
+                    self.stopped_by = stop.signal or signal.SIGTERM
                     line.say(f"Stopped at step {done} as asked.")
                     break
         if self._shard_writer is not None:  # the last checkpoint may not be on disk yet

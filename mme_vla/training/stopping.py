@@ -28,15 +28,14 @@ class StopRequest:
     """
 
     group: Any = None
-    requested: bool = False
-    """Whether this process was told to."""
-    signal: int = signal.SIGTERM
-    """Which signal this process was asked by; of processes asked by another one, SIGTERM."""
+    signal: int | None = None
+    """Which signal this process was asked by; None if it was not."""
 
     def __call__(self) -> bool:
+        requested = self.signal is not None
         if self.group is None:
-            return self.requested
-        flag = torch.tensor(int(self.requested))
+            return requested
+        flag = torch.tensor(int(requested))
         distributed.all_reduce(flag, distributed.ReduceOp.MAX, self.group)
         return bool(flag)
 
@@ -54,7 +53,6 @@ def stop_requests() -> Iterator[StopRequest]:
 
     def ask(number: int, frame: Any) -> None:
         request.signal = number
-        request.requested = True
         signal.signal(number, before[signal.Signals(number)])
 
     for number in before:
