@@ -199,11 +199,27 @@ class MMEModel(nn.Module):
         batch: Batch,
         metrics: dict[str, Tensor] | None,
     ) -> Tensor:
-        """The loss of the actions with the memory's own in training, and what is worth logging."""
-        total = action
+        """The loss of the actions with the memory's own in training, and what is worth logging.
+
+        Raises:
+            UserError: `loss_weights` names another one.
+            ValueError: one has not one number a sample.
+        """
+        # The means over the batch of the losses that memory tokens bring, unweighted.
         auxiliary: dict[str, Tensor] = {}
         if self.training:
-            auxiliary = self.auxiliary_losses(memory, batch)
+            if memory is not None:
+                for name, values in memory.losses.items():
+                    if name == "action" or values.shape != batch.prompt.shape[:1]:
+                        raise ValueError(
+                            f"The auxiliary loss {name!r} has shape {list(values.shape)}: return"
+                            f" one number a sample, [{len(batch.prompt)}], under another name than"
+                            " 'action'."
+                        )
+                    auxiliary[name] = weighted_mean(values.float(), batch.weight)
+            for name in self.loss_weights:
+                check_known("auxiliary loss in train.losses:", name, list(auxiliary))
+        total = action
         for name, value in auxiliary.items():
             weight = self.loss_weights.get(name, 1.0)
             if weight:  # 0 leaves one out
@@ -216,27 +232,6 @@ class MMEModel(nn.Module):
             if memory is not None:
                 metrics |= memory.logged()
         return total
-
-    def auxiliary_losses(self, memory: MemoryTokens | None, batch: Batch) -> dict[str, Tensor]:
-        """Means over a batch of the losses that memory tokens bring, unweighted.
-
-        Raises:
-            UserError: `loss_weights` names another one.
-            ValueError: one has not one number a sample.
-        """
-        losses: dict[str, Tensor] = {}
-        if memory is not None:
-            for name, values in memory.losses.items():
-                if name == "action" or values.shape != batch.prompt.shape[:1]:
-                    raise ValueError(
-                        f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one"
-                        f" number a sample, [{len(batch.prompt)}], under another name than"
-                        " 'action'."
-                    )
-                losses[name] = weighted_mean(values.float(), batch.weight)
-        for name in self.loss_weights:
-            check_known("auxiliary loss in train.losses:", name, list(losses))
-        return losses
 
     def forward(
         self,
