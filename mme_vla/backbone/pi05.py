@@ -88,7 +88,7 @@ class Pi05Backbone(
         self.vision = VisionTower(config.vision, config.vlm.width)
         initialise(self.vision)
         self.embedding = nn.Embedding(config.vocab_size, config.vlm.width)
-        self.embedding.shard_alone = True  # type: ignore[assignment]  # see `backbone_groups`
+        self.embedding.shard_alone = True  # type: ignore[assignment]  # see `shard_groups`
         experts = {**(extra_experts or {}), "vlm": config.vlm, "action": config.action}
         self.transformer = JointTransformer(config, experts)
         self._float32_linear: Callable[[nn.Linear, Tensor], Tensor] = float32_linear

@@ -102,11 +102,6 @@ class Embodiment:
         """What all cameras deliver beside their images, by the benchmark's names."""
         return tuple(name for camera in self.cameras for name in camera.readings)
 
-    @property
-    def augmentations(self) -> tuple[str, ...]:
-        """What is done to each camera's images in training."""
-        return tuple(camera.augment for camera in self.cameras)
-
     @classmethod
     def from_dict(cls, section: Any) -> Self:
         """Read the section `embodiment` of a configuration.

@@ -48,7 +48,7 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
 
 
 def check_integrated(
-    config: Mapping[str, Any],
+    sections: PolicySections,
     integration: Integration,
     memory: MemoryModule | None,
     supports: Set[str],
@@ -64,7 +64,7 @@ def check_integrated(
         return
     if takes_tokens and memory.budget == 0:
         raise UserError(
-            f"The memory {PolicySections.of(config).memory.get('name')!r} produces no tokens with"
+            f"The memory {sections.memory.get('name')!r} produces no tokens with"
             " these settings. Set integration=none or memory.states=true."
         )
     if not takes_tokens and memory.budget > 0:
@@ -72,11 +72,10 @@ def check_integrated(
             "This configuration names a memory without an integration; name both, or neither for"
             " the memoryless policy."
         )
-    check_past(config, memory, supports)
+    check_past(sections, memory, supports)
     if integration.memory_position != "time":
         return
     # The tokens have a time, and the backbone takes positions.
-    sections = PolicySections.of(config)
     if not memory.timed:
         raise UserError(
             "integration.memory_position=time: the tokens of the memory"
@@ -91,9 +90,8 @@ def check_integrated(
         )
 
 
-def check_past(config: Mapping[str, Any], memory: MemoryModule, supports: Set[str]) -> None:
+def check_past(sections: PolicySections, memory: MemoryModule, supports: Set[str]) -> None:
     """Make sure that the backbone reads past views if the memory gives them."""
-    sections = PolicySections.of(config)
     if memory.past_view_spec is not None and "past" not in supports:
         raise UserError(
             f"The memory {sections.memory['name']!r} gives the vision tower past views along with"

@@ -13,7 +13,6 @@ from mme_vla.backbone.base import Backbone, FineTuneSpec, HasExtraExperts
 from mme_vla.backbone.building import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.backbone.layers import check_backend
-from mme_vla.backbone.siglip import pool_grid
 from mme_vla.config.devices import FLOAT32_PRODUCTS
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, check_choice, listed
@@ -42,7 +41,7 @@ from mme_vla.speed import (
     compile_parts,
 )
 from mme_vla.speed.graphs import CapturedSampling
-from mme_vla.speed.sharding import ShardGroup, backbone_groups
+from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import (
     Batch,
     MemoryTokens,
@@ -202,7 +201,7 @@ class MMEPolicy(NetworkPolicy, Recomputes):
             memory = build_memory(
                 sections.memory, backbone.vision_width, backbone.grid, integration.memory_width
             )
-        cls._check_parts(config, integration, memory, backbone_cls.supports)
+        cls._check_parts(sections, integration, memory, backbone_cls.supports)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
     _check_parts = staticmethod(check_integrated)
@@ -220,7 +219,7 @@ class MMEPolicy(NetworkPolicy, Recomputes):
         images.
         """
         if self.training and self.augment:
-            return {"changes": self._sample_augmentation(count, generator)}
+            return {"changes": augmentation_draws(count, generator)}
         return {}
 
     def forward(
@@ -291,21 +290,28 @@ class MMEPolicy(NetworkPolicy, Recomputes):
         compile_parts(self.integration, **options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The backbone's groups. Memory and integration are in none: they are small, and compute in
-        float32.
+        """The vision tower as one group, each layer of the rest of the backbone, and each module
+        with `shard_alone = True`, such as a large embedding, in float32. Memory and integration are
+        in none: they are small, and compute in float32.
         """
-        return backbone_groups(self.backbone)
-
-    def _sample_augmentation(self, count: int, generator: torch.Generator) -> Tensor:
-        """Random numbers of the augmentation of `count` training samples, [count, …] on the CPU."""
-        return augmentation_draws(count, generator)
+        tower = self.backbone.vision
+        in_tower = set(tower.modules())
+        groups = [ShardGroup(tower, full=True)]
+        for layer in stacked_layers(self.backbone):
+            if layer not in in_tower:
+                groups.append(ShardGroup(layer))
+        for module in self.backbone.modules():
+            if getattr(module, "shard_alone", False):
+                groups.append(ShardGroup(module, full=True))
+        return groups
 
     def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
         """Views in [−1, 1], augmented as the cameras of the embodiment say."""
         views = to_unit_range(images)
         if augmentation is None:
             return views
-        return augment_views(views, self.embodiment.augmentations, augmentation)
+        augmentations = [camera.augment for camera in self.embodiment.cameras]
+        return augment_views(views, augmentations, augmentation)
 
     # Sampling
 
@@ -434,10 +440,12 @@ class MMEPolicy(NetworkPolicy, Recomputes):
 
     @property
     def memory_tower(self) -> MemoryTower:
-        return MemoryTower(self.backbone.vision, self._pooled_tokens, self.backbone.vision_width)
-
-    def _pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        return pool_grid(self.backbone.encode_images(images), grid, pooling)
+        return MemoryTower(
+            self.backbone.vision,
+            self.backbone.encode_images,
+            self.backbone.vision_width,
+            self.backbone.image_size,
+        )
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """A batch of one without content: all views, the longest prompt without padding, and a
@@ -461,10 +469,6 @@ class MMEPolicy(NetworkPolicy, Recomputes):
     def _prompt_length(self) -> int:
         words = int(PolicySections.of(self.config).processor["prompt_length"])
         return words + self.embodiment.action.options_length
-
-    def warm_up_vision(self) -> None:
-        size = self.backbone.image_size
-        self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
     @property
     def finetune_spec(self) -> FineTuneSpec:

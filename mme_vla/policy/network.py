@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers import autocast
+from mme_vla.backbone.siglip import pool_grid
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
@@ -25,14 +26,14 @@ if TYPE_CHECKING:
 class MemoryTower(NamedTuple):
     """The vision tower whose tokens a memory stores.
 
-    pooled_tokens: images as the tower takes them, side of the grid, pooling → tokens [n, grid²,
-        width].
+    encode: images [n, 3, image_size, image_size] as the tower takes them → tokens [n, s², width].
     settings: what else its tokens depend on, for the fingerprint.
     """
 
     tower: nn.Module
-    pooled_tokens: Callable[[Tensor, int, str], Tensor]
+    encode: Callable[[Tensor], Tensor]
     width: int
+    image_size: int
     settings: Sequence[str] = ()
 
 
@@ -132,10 +133,6 @@ class NetworkPolicy(Policy):
             f"{type(self).__name__} has no full_batch(), which `mme-vla analyse cost` counts."
         )
 
-    def warm_up_vision(self) -> None:
-        """Run the vision tower on one black memory frame."""
-        raise NotImplementedError
-
     @torch.no_grad()
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Encode memory-view frames [n, H, W, 3] uint8 into stored tokens [n, grid², d_vision]."""
@@ -150,7 +147,7 @@ class NetworkPolicy(Policy):
         for start in range(0, len(frames), batch_size):
             images = processor.memory_images(frames[start : start + batch_size], device=device)
             with self.autocast():
-                tokens = source.pooled_tokens(images, storage.grid, storage.pooling)
+                tokens = pool_grid(source.encode(images), storage.grid, storage.pooling)
                 encoded.append(tokens.to(empty))
         return torch.cat(encoded)
 

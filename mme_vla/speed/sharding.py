@@ -1,7 +1,7 @@
 """Sharding groups: which weights processes gather together, and in what precision."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch import nn
 
@@ -34,22 +34,6 @@ def stacked_layers(module: nn.Module) -> Iterator[nn.Module]:
             yield from inside
         else:
             yield from stacked_layers(child)
-
-
-def backbone_groups(backbone: nn.Module) -> list[ShardGroup]:
-    """The vision tower `backbone.vision` as one group, each layer of the rest, and each module with
-    `shard_alone = True`, such as a large embedding, in float32.
-    """
-    tower: Any = backbone.vision
-    in_tower = set(tower.modules())
-    groups = [ShardGroup(tower, full=True)]
-    for layer in stacked_layers(backbone):
-        if layer not in in_tower:
-            groups.append(ShardGroup(layer))
-    for module in backbone.modules():
-        if getattr(module, "shard_alone", False):
-            groups.append(ShardGroup(module, full=True))
-    return groups
 
 
 def float32_modules(group: nn.Module) -> list[nn.Module]:

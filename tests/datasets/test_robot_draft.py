@@ -46,7 +46,7 @@ def test_cameras_widths_names_and_rate_are_the_datasets() -> None:
     robot = robot_of(draft)
     assert draft.name == robot.name == "my_robot_2"
     assert robot.camera_names == ("ceiling", "wrist") and robot.memory_camera == "ceiling"
-    assert robot.augmentations == ("all", "colour")
+    assert [camera.augment for camera in robot.cameras] == ["all", "colour"]
     assert (robot.state.width, robot.action.width, robot.fps) == (4, 3, 15)
     assert robot.action.names == ("j1", "j2", "gripper")
     assert robot.action.relative == (0, 1), "a gripper stays absolute"

@@ -30,6 +30,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import FACTS, SAMPLE
 from mme_vla.envs.facts import Fact, write_facts
 from mme_vla.memory.base import stack_history
+from mme_vla.processing.images import augmentation_draws
 from mme_vla.testing.small import open_gates, random_batch, small_policy, unit_stats
 from mme_vla.training.data import SplitData, prepare_data
 from mme_vla.training.settings import DataSettings, TrainSettings
@@ -60,9 +61,8 @@ def loss_of(
     policy.loss_weights = weights
     policy.zero_grad()
     noise = policy.training_noise(2, torch.Generator().manual_seed(3))
-    loss, metrics = policy(
-        batch, noise | {"changes": policy._sample_augmentation(2, torch.Generator().manual_seed(4))}
-    )
+    changes = augmentation_draws(2, torch.Generator().manual_seed(4))
+    loss, metrics = policy(batch, noise | {"changes": changes})
     loss.backward()
     return loss.detach(), metrics
 

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers import rotation
-from mme_vla.backbone.siglip import pool_grid
 from mme_vla.extras.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
 from mme_vla.speed import Recompute, checkpoint_options
 
@@ -151,10 +150,6 @@ class Prismatic(nn.Module):
         channels = torch.cat([self.vision.dino_standard.apply(pixels), HALF.apply(pixels)], dim=-3)
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
             return self.vision(channels)
-
-    def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        """Fused tokens [n, grid², d_vision] as memories store them."""
-        return pool_grid(self.encode_images(images), grid, pooling)
 
     def embed(self, ids: Tensor) -> Tensor:
         """Embeddings [..., d] of token ids."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.pi05 import initialise
-from mme_vla.backbone.siglip import VisionTower, pool_grid
+from mme_vla.backbone.siglip import VisionTower
 from mme_vla.errors import missing_extra, require
 from mme_vla.extras.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.speed import Recompute, run_layer
@@ -323,7 +323,3 @@ class DiffusionNetwork(nn.Module):
         words = self.text_proj(text)[:, None].expand(-1, images.shape[1], -1)
         steps = torch.cat([points, state, words], dim=-1).flatten(1)
         return steps if memory is None else torch.cat([steps, memory], dim=-1)
-
-    def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        """Images [n, 3, s, s] in [−1, 1] → tokens [n, grid², d_vision] as memories store them."""
-        return pool_grid(self.vision(images), grid, pooling)

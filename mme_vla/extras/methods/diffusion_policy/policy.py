@@ -133,7 +133,7 @@ class DiffusionPolicy(MethodPolicy):
             memory = build_memory(
                 sections.memory, sizes.memory_width, grid, integration.memory_width
             )
-            check_past(config, memory, frozenset())
+            check_past(sections, memory, frozenset())
         processor = processor_for(DiffusionProcessor, processor, "dp, or dp_tiny to try things out")
         return cls(network, memory, integration, processor, config, **policy_options(cls, config))
 
@@ -295,9 +295,8 @@ class DiffusionPolicy(MethodPolicy):
     @property
     def memory_tower(self) -> MemoryTower:
         self.require_memory()
-        return MemoryTower(
-            self.backbone.vision, self.backbone.pooled_tokens, self.sizes.memory_width
-        )
+        vision, sizes = self.backbone.vision, self.sizes
+        return MemoryTower(vision, vision, sizes.memory_width, sizes.memory_tower.image_size)
 
     # Costs
 
@@ -315,7 +314,3 @@ class DiffusionPolicy(MethodPolicy):
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
             history=history,
         )
-
-    def warm_up_vision(self) -> None:
-        side = self.sizes.memory_tower.image_size
-        self.backbone.vision(torch.zeros(1, 3, side, side, device=self.device))

@@ -150,7 +150,7 @@ class MemoryVlaPolicy(MethodPolicy):
             memory = build_memory(
                 sections.memory, sizes.vision.width, sizes.vision.grid, sizes.perceptual_width
             )
-            check_past(config, memory, frozenset())
+            check_past(sections, memory, frozenset())
         return cls(vlm, core, memory, processor, config, **policy_options(cls, config))
 
     # Moments
@@ -396,12 +396,12 @@ class MemoryVlaPolicy(MethodPolicy):
 
     @property
     def memory_tower(self) -> MemoryTower:
-        vlm = self.vlm
+        vlm, sizes = self.vlm, self.sizes.vision
         image_format = ""
         if isinstance(self.processor, MemoryVlaProcessor):
             image_format = self.processor.memory_image_format
         settings = (image_format, str(vlm.vision.dino_standard))
-        return MemoryTower(vlm.vision, vlm.pooled_tokens, self.sizes.vision.width, settings)
+        return MemoryTower(vlm.vision, vlm.encode_images, sizes.width, sizes.image_size, settings)
 
     # Costs
 
@@ -426,10 +426,6 @@ class MemoryVlaPolicy(MethodPolicy):
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
             history=history,
         )
-
-    def warm_up_vision(self) -> None:
-        size = self.sizes.vision.image_size
-        self.vlm.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
 
 def _memoryvla_episode(episode: Episode) -> MemoryVlaEpisode:

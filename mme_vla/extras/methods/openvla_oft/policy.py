@@ -18,7 +18,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.network import MemoryTower
 from mme_vla.registry import POLICIES
-from mme_vla.types import Batch, to_unit_range
+from mme_vla.types import Batch, Noise, to_unit_range
 
 
 @POLICIES.register("openvla")
@@ -50,9 +50,12 @@ class OpenVlaPolicy(MMEPolicy):
             proprio=torch.zeros(1, self.embodiment.state.width, device=device),
         )
 
-    def _sample_augmentation(self, count: int, generator: torch.Generator) -> Tensor:
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
+        if not (self.training and self.augment):
+            return {}
         views = len(self.embodiment.cameras)
-        return draw_changes(count * views, generator).unflatten(0, (count, views))
+        changes = draw_changes(count * views, generator)
+        return {"changes": changes.unflatten(0, (count, views))}
 
     def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
         flat = images.flatten(0, 1)

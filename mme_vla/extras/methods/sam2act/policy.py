@@ -387,9 +387,5 @@ class SAM2ActPolicy(NetworkPolicy, Recomputes):
             collision=integers.clone(),
         )
 
-    def warm_up_vision(self) -> None:
-        side = self.backbone.encoder.side
-        self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))
-
 
 _point_finder = lru_cache(maxsize=2)(PointFinder)

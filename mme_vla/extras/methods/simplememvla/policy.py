@@ -15,7 +15,6 @@ from torch.nn import functional
 from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.backbone.building import shapes_only
 from mme_vla.backbone.flow import EULER_STEPS
-from mme_vla.backbone.siglip import pool_grid
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.network import MethodPolicy, processor_for
@@ -167,7 +166,7 @@ class SimpleMemVlaPolicy(MethodPolicy):
         if sections.memory:
             grid = sizes.image_size // sizes.factor
             memory = build_memory(sections.memory, sizes.width, grid, sizes.memory_width)
-            check_past(config, memory, frozenset())
+            check_past(sections, memory, frozenset())
             if not memory.budget:
                 raise UserError(
                     f"The memory {sections.memory['name']!r} has no tokens with these settings."
@@ -466,12 +465,15 @@ class SimpleMemVlaPolicy(MethodPolicy):
     def memory_tower(self) -> MemoryTower:
         self.require_memory()
         return MemoryTower(
-            self.backbone.model.visual, self._pooled_tokens, self.sizes.width, ("one image",)
+            self.backbone.model.visual,
+            self._encode_images,
+            self.sizes.width,
+            self.sizes.image_size,
+            ("one image",),
         )
 
-    def _pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        pairs = images[:, None].expand(-1, TEMPORAL, -1, -1, -1)
-        return pool_grid(self.backbone.encode_patches(pairs), grid, pooling)
+    def _encode_images(self, images: Tensor) -> Tensor:
+        return self.backbone.encode_patches(images[:, None].expand(-1, TEMPORAL, -1, -1, -1))
 
     # Costs
 
@@ -514,11 +516,6 @@ class SimpleMemVlaPolicy(MethodPolicy):
             history=history,
             words=((1,) * (_RESPONSE_TOKENS - 2),),
         )
-
-    def warm_up_vision(self) -> None:
-        side = self.sizes.image_size
-        image = torch.zeros(1, 3, side, side, dtype=torch.uint8, device=self.device)
-        self.backbone.encode_patches(image[:, None].expand(-1, TEMPORAL, -1, -1, -1))
 
 
 def _augmented(

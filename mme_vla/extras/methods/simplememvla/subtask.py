@@ -184,7 +184,7 @@ class SubtaskPolicy(MMEPolicy):
 
     @staticmethod
     def _check_parts(
-        config: Mapping[str, Any],
+        sections: PolicySections,
         integration: Integration,
         memory: MemoryModule | None,
         supports: Set[str],

@@ -76,7 +76,9 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
         of_memory = flops(lambda: memory(batch.history))
         # The frames between two chunks are encoded.
         stored = memory.storage.stored_frames(2 * REPLAN)
-        frames = int((stored >= REPLAN).sum()) * flops(policy.warm_up_vision)
+        tower = policy.memory_tower
+        image = torch.zeros(1, 3, tower.image_size, tower.image_size, device="meta")
+        frames = int((stored >= REPLAN).sum()) * flops(lambda: tower.encode(image))
     if isinstance(memory, RecurrentMemory):
         # A stream reads its last frame alone.
         history: Any = batch.history
