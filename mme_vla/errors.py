@@ -1,6 +1,6 @@
 """The one exception a command shows without a traceback, and the words for a misspelt name."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -62,22 +62,6 @@ def require(holds: object, message: str, error: type[Exception] = UserError) -> 
 
 ERROR = "Error: "
 """What a command prints before the message of an error."""
-
-
-def check_all(*checks: Callable[[], object]) -> None:
-    """Call checks that do not need each other's success, and name all that failed in one error.
-
-    Raises:
-        UserError: the messages of the failed checks, one a line. Each line begins as the first
-            does once a command prints it.
-    """
-    failed = []
-    for check in checks:
-        try:
-            check()
-        except UserError as error:
-            failed.append(text_of(error))
-    require(not failed, f"\n{ERROR}".join(failed))
 
 
 def check_choice(key: str, value: object, options: Iterable[str]) -> None:

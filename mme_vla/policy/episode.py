@@ -152,21 +152,22 @@ class Episode:
                 has begun.
         """
         # All checks come first: after an error the same frames can be observed again.
-        images = {}
+        views = {}
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count = len(states) if states.ndim else 0
         width = self._robot.state.width
         is_even = True
         for name in self._robot.camera_names:
-            images[name] = self._checked_view(frames, name)
-            n_rendered = count
+            images = self._checked_view(frames, name)
+            indices = np.arange(count)
             if rendered is not None:
-                n_rendered = len(_checked_indices(rendered, name, count))
-            if len(images[name]) != n_rendered:
+                indices = _checked_indices(rendered, name, count)
+            if len(images) != len(indices):
                 is_even = False
+            views[name] = FrameBatch.of(images, indices, count)
         if states.shape != (count, width) or not is_even or demo.shape not in ((), (count,)):
-            counts = ", ".join(f"{len(view)} {name}" for name, view in images.items())
+            counts = ", ".join(f"{len(view.images)} {name}" for name, view in views.items())
             raise UserError(
                 f"observe() needs as many {width}-number states and is_demo flags as images of"
                 f" every camera: got {counts}, states of shape {states.shape} and is_demo of"
@@ -174,8 +175,6 @@ class Episode:
             )
         if count == 0:
             return
-        indices = dict.fromkeys(images) if rendered is None else rendered
-        views = {name: FrameBatch.of(view, indices[name], count) for name, view in images.items()}
         processor = self.policy.require_processor()
         check_reach(states, self._state_stats(), "a state")
         demo, executed = self._checked_course(count, demo, actions)
@@ -193,7 +192,7 @@ class Episode:
             self._recent = self._recent[:-1]  # the end of a piece, at which nothing was decided
         self._take(views[self._robot.memory_camera], demo, executed, states)
         if self._past is not None:
-            self._past.take(views)
+            self._past.take(views, self.n_observed_frames - count, self.n_observed_frames)
         self._recent = [*self._recent, *new_frames][-samples.window :]
         self._acted = False
 

@@ -137,14 +137,11 @@ class PastImages:
     def __init__(self, spec: PastViewSpec) -> None:
         self.spec = spec
         self._frames: dict[int, list[np.ndarray]] = {}
-        self._count = 0
 
-    def take(self, views: Mapping[str, FrameBatch]) -> None:
-        """Add the next frames of every camera."""
-        first = self._count
-        self._count += next(iter(views.values())).length
-        oldest = self._count - 1 - self.spec.span
-        for frame in range(max(oldest, first), self._count):
+    def take(self, views: Mapping[str, FrameBatch], first: int, stop: int) -> None:
+        """Add the frames `first` … `stop` − 1 of every camera, the next ones of the episode."""
+        oldest = stop - 1 - self.spec.span
+        for frame in range(max(oldest, first), stop):
             images = [view.image(frame - first) for view in views.values()]
             rendered = [image.copy() for image in images if image is not None]
             if len(rendered) == len(views):

@@ -99,7 +99,6 @@ class Processor(PolicyProcessor):
         check_integer("processor.action_dim", action_dim)
         if subgoal_length is not None:
             check_integer("processor.subgoal_length", subgoal_length)
-        require(isinstance(prompt, str), f"processor.prompt must be a name, got {brief(prompt)}.")
         self.prompt_format = PROMPTS[prompt]()
         self.prompt_name = prompt
         self.tokenizer = tokenizer
@@ -139,11 +138,6 @@ class Processor(PolicyProcessor):
             self.prompt_format.past_actions,
             self.tokenizer.fingerprint,
         )
-
-    @property
-    def longest_prompt(self) -> int:
-        """Tokens of a prompt: `prompt_length`, and what the robot's options have."""
-        return self.prompt_length + self.embodiment.action.options_length
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
         """Resize the current images of all cameras with Pillow, as released.
@@ -214,7 +208,8 @@ class Processor(PolicyProcessor):
             subgoal = spelled(checked_text(subgoal, "the subgoal"), self.goal_case)
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
         inputs = PromptInput(goal, subgoal, normalised, past)
-        return encode_prompt(self.prompt_format, self.tokenizer, inputs, self.longest_prompt)
+        longest = self.prompt_length + self.embodiment.action.options_length
+        return encode_prompt(self.prompt_format, self.tokenizer, inputs, longest)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """Convert recorded actions into targets of the network.

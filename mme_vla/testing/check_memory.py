@@ -4,7 +4,7 @@ integrations rely on.
 
 from copy import deepcopy
 from dataclasses import fields, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ ROUNDING = 0.1
 """How much bfloat16 features may change tokens, as a share of the largest."""
 LABELS = {"subtask_boundary", "subtask_index", "fact_visible", "fact_index"}
 """Labels of one number a frame in any dataset."""
-_Kind = TypeVar("_Kind", bound=History)
 
 
 def check_memory(name: str, frames: int = 80, **options: Any) -> None:
@@ -101,7 +100,7 @@ class Episode:
         history = CachedHistory(spec, tokens.numpy(), stored, length, scores, self.exec_start)
         return self._with_motion(history)
 
-    def _with_motion(self, history: _Kind) -> _Kind:
+    def _with_motion[H: History](self, history: H) -> H:
         """The history with proprioception and actions, where its memory reads them."""
         history.state_width = STATE
         if self.memory.uses_proprio:

@@ -1,6 +1,6 @@
 """What a probe may be told (`configs/probe.yaml`), checked before PyTorch is imported."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -8,7 +8,7 @@ from typing import Any, Self
 from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, read_section
 from mme_vla.data.lerobot_files import resolve_root
 from mme_vla.data.sources import listed_sources
-from mme_vla.errors import UserError, brief, check_all, check_choice, require
+from mme_vla.errors import ERROR, UserError, brief, check_choice, require, text_of
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import check_config
 from mme_vla.memory.perturbation import Word, split_word
@@ -129,6 +129,22 @@ class ProbeChoice:
             return
         for entry in listed_sources(self.recordings):
             resolve_root(entry.root)
+
+
+def check_all(*checks: Callable[[], object]) -> None:
+    """Call checks that do not need each other's success, and name all that failed in one error.
+
+    Raises:
+        UserError: the messages of the failed checks, one a line. Each line begins as the first
+            does once a command prints it.
+    """
+    failed = []
+    for check in checks:
+        try:
+            check()
+        except UserError as error:
+            failed.append(text_of(error))
+    require(not failed, f"\n{ERROR}".join(failed))
 
 
 def check_probe(config: Mapping[str, Any]) -> None:
