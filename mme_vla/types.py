@@ -45,11 +45,11 @@ def named_noise(noise: Mapping[str, Tensor] | Tensor | None, time: Tensor | None
     return named
 
 
-def stack_noise(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Noise:
+def stack_noise(rows: Sequence[Mapping[str, Tensor]]) -> Noise:
     """Noise of single samples (`sampling_noise`) as that of a batch."""
     if not rows:
         return {}
-    return {name: torch.stack([row[name] for row in rows]).to(device) for name in rows[0]}
+    return {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
 
 
 def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -> Noise:

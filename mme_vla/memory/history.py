@@ -9,7 +9,7 @@ import hashlib
 import inspect
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -358,7 +358,7 @@ class OnlineHistory(History):
         return np.asarray(self._stored_frames, np.int64)
 
     def to_encode(self, count: int, rendered: np.ndarray | None = None) -> np.ndarray:
-        """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`.
+        """Of the next `count` frames, which (offsets from 0) `take` encodes.
 
         Args:
             rendered: offsets of those that have an image; by default all.
@@ -369,31 +369,22 @@ class OnlineHistory(History):
             return offsets
         return np.intersect1d(offsets, rendered)
 
-    def append(
-        self,
-        frames: Sequence[np.ndarray] | np.ndarray,
-        tokens: Tensor,
-        rendered: np.ndarray | None = None,
-        count: int | None = None,
-    ) -> None:
+    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order.
 
         Args:
-            frames: images [n, H, W, 3] uint8.
-            tokens: of those of `to_encode`, [k, patches, d_vision].
-            rendered: offsets [n] of the images among the frames, of which there are `count`; by
-                default they are all.
+            encode: images [n, H, W, 3] uint8 → tokens [n, patches, d_vision]; called once, for the
+                frames of `to_encode`.
         """
-        if count is None:
-            count = len(frames)
-        offsets = self.to_encode(count, rendered)
+        offsets = self.to_encode(frames.length, frames.index)
+        tokens = encode(frames.select(offsets))
         patches = self.spec.grid**2
         if len(tokens) != len(offsets) or (len(tokens) and tokens.shape[1] != patches):
             raise ValueError(
-                f"append() got tokens {list(tokens.shape)}, expected [{len(offsets)}, {patches},"
-                " d]: see to_encode() and StorageSpec.grid."
+                f"encode() returned tokens {list(tokens.shape)}, expected [{len(offsets)},"
+                f" {patches}, d]: see StorageSpec.grid."
             )
-        self._score(frames, np.arange(count) if rendered is None else rendered)
+        self._score(frames)
         if len(tokens):
             start = len(self._stored_frames)
             stop = start + len(tokens)
@@ -406,25 +397,13 @@ class OnlineHistory(History):
             assert self._tokens is not None
             self._tokens[start:stop] = tokens
             self._stored_frames.extend((offsets + self._length).tolist())
-        self._length += count
+        self._length += frames.length
 
-    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
-        """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches,
-        d_vision].
-        """
-        stored = frames.select(self.to_encode(frames.length, frames.index))
-        self.append(frames.images, encode(stored), frames.index, frames.length)
-
-    def _score(self, frames: Sequence[np.ndarray] | np.ndarray, offsets: np.ndarray) -> None:
-        """Score the next frames that have an image.
-
-        Args:
-            frames: images [n, H, W, 3] uint8.
-            offsets: their offsets [n] from the next frame.
-        """
+    def _score(self, frames: FrameBatch) -> None:
+        """Score the next frames that have an image."""
         if self._scorer is None:
             return
-        for frame, image in zip((offsets + self._length).tolist(), frames, strict=True):
+        for frame, image in zip((frames.index + self._length).tolist(), frames.images, strict=True):
             values = score_frame(self._scorer, frame, image)
             if values is not None:
                 self._scored_frames.append(frame)
@@ -519,22 +498,12 @@ class LazyHistory(OnlineHistory):
         """Add frames in order, without encoding any."""
         offsets = self.to_encode(frames.length, frames.index)
         images = frames.select(offsets)
-        self._score(frames.images, frames.index)
+        self._score(frames)
         for frame, image in zip((offsets + self._length).tolist(), images, strict=True):
             # A copy: a view would keep the whole message alive that a frame came in.
             self._waiting[frame] = image.copy()
             self._stored_frames.append(frame)
         self._length += frames.length
-
-    def append(
-        self,
-        frames: Sequence[np.ndarray] | np.ndarray,
-        tokens: Tensor,
-        rendered: np.ndarray | None = None,
-        count: int | None = None,
-    ) -> None:
-        """Add frames whose tokens are there already."""
-        raise TypeError("A LazyHistory encodes its frames itself: give them to take().")
 
     def gather(self, indices: np.ndarray) -> Tensor:
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch), encoding the frames

@@ -51,17 +51,6 @@ from mme_vla.utils import Sums, checked_file, inside
 TOKENIZER_FILE = "tokenizer.model"
 
 
-def saved_file(folder: Path, name: Any, what: str) -> Path:
-    """The path of a file that a checkpoint names in itself; where the folder has checksums, it must
-    have one.
-    """
-    require(
-        isinstance(name, str),
-        f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.",
-    )
-    return checked_file(folder, name, what)
-
-
 @PROCESSORS.register("pi05")
 class Processor(PolicyProcessor):
     """Converts raw images, text, states and actions into the network's inputs, and its chunks into
@@ -357,10 +346,10 @@ class Processor(PolicyProcessor):
             Sums(folder).check(TOKENIZER_FILE)
             tokenizer = inside(folder, TOKENIZER_FILE, "tokenizer")
         elif tokenizer is None:
-            tokenizer = saved_file(folder, named, "tokenizer")
+            tokenizer = checked_file(folder, named, "tokenizer")
         stats = config.get("stats")
         if stats is not None:
-            stats = saved_file(folder, stats, "statistics")
+            stats = checked_file(folder, stats, "statistics")
         try:
             return cls.from_config({**config, "tokenizer": tokenizer, "stats": stats})
         except UserError as error:

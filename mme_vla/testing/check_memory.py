@@ -13,7 +13,7 @@ from mme_vla.memory.base import Memory, check_scorer, stack_history
 from mme_vla.memory.history import CachedHistory, History, OnlineHistory, score_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
-from mme_vla.types import HistoryTokens, Labels, MemoryTokens, ReadsLabels
+from mme_vla.types import FrameBatch, HistoryTokens, Labels, MemoryTokens, ReadsLabels
 
 D_VISION, WIDTH, MOTION, STATE = 32, 48, 17, 8
 TOLERANCE = 1e-4
@@ -121,15 +121,15 @@ class Episode:
         """The first `until` frames, of which only some have an image."""
         history = self._empty()
         tokens = self.tokens[history.to_encode(until, rendered)]
-        history.append(self.images[rendered], tokens, rendered, until)
+        history.take(FrameBatch.of(self.images[rendered], rendered, until), lambda _: tokens)
         return history
 
     def extend(self, history: OnlineHistory, piece: int, until: int) -> None:
         """Deliver the frames that a history lacks, up to `until`."""
         for start in range(len(history), until, piece):
             stop = min(start + piece, until)
-            required = history.to_encode(stop - start)
-            history.append(self.images[start:stop], self.tokens[start:stop][required])
+            tokens = self.tokens[start:stop][history.to_encode(stop - start)]
+            history.take(FrameBatch.of(self.images[start:stop]), lambda _, made=tokens: made)
 
 
 def check_selection(memory: Memory, fresh: Memory, frames: int) -> None:

@@ -150,6 +150,7 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     `../../blobs/…`: these count as its own. So do the files of the installed library, which some
     installers link to a cache (`uv pip install --link-mode symlink`).
     """
+    require(isinstance(name, str), f"{folder}: {what}={brief(name)} must be the name of a file.")
     place = folder / name
     root = folder.resolve()
     try:

@@ -25,6 +25,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
+from mme_vla.types import FrameBatch
 
 COMMAND = "mme-vla cache model=mine data=here"
 
@@ -64,7 +65,9 @@ def test_cached_and_online_histories_are_the_same(
             frame = source.frames(episode, [t])
             expected = frame[online.to_encode(1)]
             tokens = encode(expected) if len(expected) else torch.zeros(0, 4, WIDTH)
-            online.append(frame, tokens.to(torch.bfloat16) if dtype == "bfloat16" else tokens)
+            if dtype == "bfloat16":
+                tokens = tokens.to(torch.bfloat16)
+            online.take(FrameBatch.of(frame), lambda _, made=tokens: made)
             cached, streamed = (
                 memory.gather_selection(history, t),
                 memory.gather_selection(online, t),

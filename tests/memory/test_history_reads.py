@@ -36,7 +36,7 @@ def history_of(kind: str) -> History:
         lazy.take(FrameBatch.of(np.tile(numbers, (1, 8, 8, 3))), lambda images: TOKENS)
         return lazy
     online = OnlineHistory(SPEC)
-    online.append(IMAGES, TOKENS)
+    online.take(FrameBatch.of(IMAGES), lambda images: TOKENS)
     return online
 
 
@@ -107,9 +107,9 @@ def test_a_history_of_another_grid_or_pooling_is_refused(spec: StorageSpec) -> N
         FrameSamp(8, 4, budget=8, grid=2).gather_selection(history, 3)
 
 
-def test_tokens_of_another_grid_are_not_appended() -> None:
-    with pytest.raises(ValueError, match=r"got tokens \[10, 16, 8\], expected \[10, 4, d\]"):
-        OnlineHistory(SPEC).append(IMAGES, torch.zeros(FRAMES, 16, 8))
+def test_tokens_of_another_grid_are_not_taken() -> None:
+    with pytest.raises(ValueError, match=r"returned tokens \[10, 16, 8\], expected \[10, 4, d\]"):
+        OnlineHistory(SPEC).take(FrameBatch.of(IMAGES), lambda images: torch.zeros(FRAMES, 16, 8))
 
 
 def test_a_memory_that_chooses_by_scores_gets_no_history_without() -> None:
@@ -121,7 +121,7 @@ def test_a_memory_that_chooses_by_scores_gets_no_history_without() -> None:
     with pytest.raises(UserError, match=message):
         CachedHistory(memory.storage, TOKENS[stored].numpy(), stored, FRAMES)
     online = OnlineHistory(memory.storage, memory.make_scorer())
-    online.append(IMAGES, TOKENS[stored])
+    online.take(FrameBatch.of(IMAGES), lambda images: TOKENS[stored])
     scores = score_frames(memory.make_scorer(), dict(enumerate(IMAGES)), 4)
     cached = CachedHistory(memory.storage, TOKENS[stored].numpy(), stored, FRAMES, scores)
     for history in (online, cached):

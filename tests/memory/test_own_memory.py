@@ -26,6 +26,7 @@ from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.registry import MEMORIES
 from mme_vla.testing import check_memory
 from mme_vla.testing.small import moving_frames, open_gates, random_batch, unit_stats
+from mme_vla.types import FrameBatch
 
 EXAMPLE = REPOSITORY / "examples" / "last_frames"
 
@@ -97,7 +98,7 @@ def test_a_scorer_of_the_first_frame_does_not_take_the_budget_twice(rules):
     """`Contrast` scores frame 0, whose patches are kept anyway."""
     memory = rules.ContrastDrop(64, 32, budget=40, grid=4, stride=4)
     history = OnlineHistory(memory.storage, memory.make_scorer())
-    history.append(moving_frames(24), torch.zeros(len(history.to_encode(24)), 16, 64))
+    history.take(FrameBatch.of(moving_frames(24)), lambda images: torch.zeros(len(images), 16, 64))
     selection = memory.select(history, 23)
     assert len(np.unique(selection, axis=0)) == len(selection) == 40
 
@@ -209,7 +210,7 @@ def test_the_pages_rules_choose_other_patches(rules):
     for kind in (TokenDrop, rules.RecentChanges, rules.ContrastDrop):
         memory = kind(64, 32, budget=20, grid=4, stride=4)
         history = OnlineHistory(memory.storage, memory.make_scorer())
-        history.append(frames, torch.zeros(len(history.to_encode(41)), 16, 64))
+        history.take(FrameBatch.of(frames), lambda images: torch.zeros(len(images), 16, 64))
         selections.append(memory.select(history, 40).tolist())
     assert selections[0] != selections[1] != selections[2] != selections[0]
 

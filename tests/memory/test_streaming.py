@@ -14,7 +14,7 @@ from mme_vla.testing.small import (
     moving_frames,
     small_policy,
 )
-from mme_vla.types import Batch
+from mme_vla.types import Batch, FrameBatch
 
 FRAMES = 90
 FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
@@ -42,8 +42,7 @@ def online_history(policy, frames: np.ndarray, chunk: int, exec_start: int = 0) 
     memory = policy.require_memory()
     history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
     for start in range(0, len(frames), chunk):
-        part = frames[start : start + chunk]
-        history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))
+        history.take(FrameBatch.of(frames[start : start + chunk]), policy.encode_frames)
     return history
 
 

@@ -17,6 +17,7 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop, most_changed, ranked_patches
 from mme_vla.memory.ttt import TTT
 from mme_vla.processing.images import resize_with_pad
+from mme_vla.types import FrameBatch
 from mme_vla.weights.names.jax_backbone import _vision
 from mme_vla.weights.tables import read
 
@@ -60,8 +61,8 @@ def history_of(memory, frames, tokens, until: int) -> OnlineHistory:
     history = OnlineHistory(memory.storage, memory.make_scorer())
     pooled = pool_grid(tokens, memory.storage.grid)
     for t in range(until + 1):
-        n_required = history.to_encode(1) + t
-        history.append(frames[t : t + 1], pooled[n_required])
+        stored = history.to_encode(1) + t
+        history.take(FrameBatch.of(frames[t : t + 1]), lambda _, made=pooled[stored]: made)
     return history
 
 

@@ -53,10 +53,10 @@ from mme_vla.processing.base import (
 )
 from mme_vla.processing.images import as_uint8_frames
 from mme_vla.processing.normalise import NormStats, QuantileStats
-from mme_vla.processing.processor import saved_file
 from mme_vla.processing.prompt import GOAL_CASES, goal_case, spelled
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import HistoryTokens, TensorStruct
+from mme_vla.utils import checked_file
 
 NAME = "simplememvla"
 TOKENIZER_FILE = "tokenizer.json"
@@ -454,7 +454,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
             )
         if tokenizer is None:
             named = values.get("tokenizer")
-            tokenizer = BYTES if named == BYTES else saved_file(folder, named, "tokenizer")
+            tokenizer = BYTES if named == BYTES else checked_file(folder, named, "tokenizer")
         words = WordTokenizer.load(tokenizer)
         if words.fingerprint != fingerprint:
             raise UserError(
@@ -463,7 +463,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
                 " the file that was used."
             )
         settings = read_section(PromptSettings, values, f"{folder / CONFIG_FILE}: processor")
-        built = None if stats is None else NormStats.load(saved_file(folder, stats, "statistics"))
+        built = None if stats is None else NormStats.load(checked_file(folder, stats, "statistics"))
         return cls(settings, robot, **sizes, tokenizer=words, stats=built)
 
 

@@ -22,6 +22,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import SubgoalText
+from mme_vla.types import FrameBatch
 from mme_vla.utils.media import GROUND
 from mme_vla.utils.style import COLOURS, FAINT, figure, svg
 
@@ -197,7 +198,7 @@ def selection_sheets(
     n_observed = 0
     for step in range(start, length, every):
         part = frames[n_observed : step + 1]
-        history.append(part, torch.zeros(len(history.to_encode(len(part))), patches, 1))
+        history.take(FrameBatch.of(part), lambda images: torch.zeros(len(images), patches, 1))
         n_observed = step + 1
         selected = memory.select(TokenlessHistory(history), step)
         title = (
