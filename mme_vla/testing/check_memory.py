@@ -120,16 +120,19 @@ class Episode:
     def sparse(self, rendered: np.ndarray, until: int) -> OnlineHistory:
         """The first `until` frames, of which only some have an image."""
         history = self._empty()
-        tokens = self.tokens[history.to_encode(until, rendered)]
-        history.take(FrameBatch.of(self.images[rendered], rendered, until), lambda _: tokens)
+        self._deliver(history, FrameBatch.of(self.images[rendered], rendered, until))
         return history
 
     def extend(self, history: OnlineHistory, piece: int, until: int) -> None:
         """Deliver the frames that a history lacks, up to `until`."""
         for start in range(len(history), until, piece):
             stop = min(start + piece, until)
-            tokens = self.tokens[start:stop][history.to_encode(stop - start)]
-            history.take(FrameBatch.of(self.images[start:stop]), lambda _, made=tokens: made)
+            self._deliver(history, FrameBatch.of(self.images[start:stop]))
+
+    def _deliver(self, history: OnlineHistory, frames: FrameBatch) -> None:
+        """Add the next frames with their tokens."""
+        stored = len(history) + history.to_encode(frames.length, frames.index)
+        history.take(frames, lambda _: self.tokens[stored])
 
 
 def check_selection(memory: Memory, fresh: Memory, frames: int) -> None:

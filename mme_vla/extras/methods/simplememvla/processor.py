@@ -453,7 +453,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
                 " numbers."
             )
         if tokenizer is None:
-            named = values.get("tokenizer")
+            named = values.get("tokenizer", "")
             tokenizer = BYTES if named == BYTES else checked_file(folder, named, "tokenizer")
         words = WordTokenizer.load(tokenizer)
         if words.fingerprint != fingerprint:
