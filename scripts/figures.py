@@ -45,6 +45,7 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.rmt import RMT
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.memory.ttt import TTT
+from mme_vla.types import FrameBatch
 from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, LINE, VIDEO, log_scale, look, rgb, svg
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,8 +70,8 @@ def replay(memory: MemoryModule, source: EpisodeSource) -> OnlineHistory:
     """The history of the whole episode, as an episode in closed loop builds it."""
     frames = source.frames(EPISODE, np.arange(int(source.lengths[EPISODE])))
     history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[EPISODE]))
-    stored = history.to_encode(len(frames))
-    history.append(frames, torch.zeros(len(stored), memory.storage.grid**2, 1))
+    patches = memory.storage.grid**2
+    history.take(FrameBatch.of(frames), lambda images: torch.zeros(len(images), patches, 1))
     return history
 
 
