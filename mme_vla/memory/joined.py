@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -65,13 +65,13 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         built: list[MemoryModule] = []
         names: list[str] = []
         self.names: list[str] = []
-        for section in shares(members, budget):
+        for member in shares(members, budget):
+            section = {**member.options, "name": member.name, "budget": member.budget}
             built.append(MEMORIES.build(section, d_vision=d_vision, width=width))
             # Equal names get a number.
-            name = section["name"]
-            names.append(name)
-            count = names.count(name)
-            self.names.append(name if count == 1 else f"{name}_{count}")
+            names.append(member.name)
+            count = names.count(member.name)
+            self.names.append(member.name if count == 1 else f"{member.name}_{count}")
         self.members = nn.ModuleList(built)
         by_name = dict(zip(self.names, built, strict=True))
         self.storage = common_storage({name: one.storage for name, one in by_name.items()})
@@ -289,23 +289,30 @@ def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
     return np.stack([np.repeat(indices[:, 0], times**2), patches.reshape(-1)], axis=1)
 
 
-def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict[str, Any]]:
-    """The section of every member with a budget: its own, or an even share of what the others
-    leave.
-    """
+@dataclass(frozen=True)
+class Member:
+    """One of the memories that are joined; options: its own, without name and budget."""
+
+    name: str
+    budget: int | None
+    options: Mapping[str, Any]
+
+
+def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[Member]:
+    """Every member with a budget: its own, or an even share of what the others leave."""
     require(
         not isinstance(members, str | Mapping) and len(members) >= 2,
         f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].",
     )
-    sections: list[dict[str, Any]] = []
+    read: list[Member] = []
     taken = 0
     n_open = 0
     for member in members:
-        section: dict[str, Any] = {"name": member}
+        options: dict[str, Any] = {"name": member}
         if isinstance(member, Mapping):
-            section = dict(member)
-        name = section.get("name")
-        member_budget = section.get("budget")
+            options = dict(member)
+        name = options.pop("name", None)
+        member_budget = options.pop("budget", None)
         require(
             isinstance(name, str) and name != "joined",
             f"memory.members: {brief(member)} is no memory to join; give a name, or {{name: …}}.",
@@ -315,7 +322,7 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
             f"memory.members: {brief(member)}: budget={brief(member_budget)} must be a whole"
             " number.",
         )
-        sections.append(section)
+        read.append(Member(name, member_budget, options))
         if member_budget is None:
             n_open += 1
         else:
@@ -324,15 +331,12 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
     if share >= SHARE_UNIT:
         share -= share % SHARE_UNIT
     if taken > budget or (n_open and share < 1):
-        requests = [f"{one['name']} {one.get('budget') or 'an even share'}" for one in sections]
+        requests = [f"{one.name} {one.budget or 'an even share'}" for one in read]
         raise UserError(
             f"memory.budget={budget} is less than its members use ({', '.join(requests)}): lower"
             " their budgets, or raise it."
         )
-    for section in sections:
-        if section.get("budget") is None:
-            section["budget"] = share
-    return sections
+    return [replace(one, budget=share) if one.budget is None else one for one in read]
 
 
 def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
