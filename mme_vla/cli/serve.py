@@ -81,4 +81,4 @@ async def run(server: PolicyServer) -> None:
     except asyncio.CancelledError:
         logger.warning("stopped at once; requests were cut off")
         os._exit(1)  # the policy's thread cannot be interrupted
-    logger.info("stopped · %s", server.stats.line())
+    logger.info("stopped · %s", server.stats.line(server.n_clients))

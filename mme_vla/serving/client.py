@@ -4,7 +4,7 @@ import re
 import socket
 import struct
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from typing import Any, Self
 
 import numpy as np
@@ -68,7 +68,6 @@ class Client:
         self._headers = key_header(api_key)
         self._address = without_user(url)  # for messages
         self._socket: Any = None
-        self._ends = ExitStack()
         self.metadata: dict[str, Any] = {}
         """Description of the server, its first message."""
         self.reconnect()
@@ -78,8 +77,7 @@ class Client:
         begun.
         """
         self.close()
-        opening = open_socket(self.url, self._headers, self.open_timeout, self.timeout)
-        self._socket = self._ends.enter_context(opening)
+        self._socket = open_socket(self.url, self._headers, self.open_timeout, self.timeout)
         self.metadata = self._receive(self.open_timeout)
 
     def reset(self, seed: int | None = None) -> dict[str, Any]:
@@ -139,8 +137,10 @@ class Client:
 
     def close(self) -> None:
         """Close the connection; the server frees the episode."""
-        self._socket = None
-        self._ends.close()
+        opened = self._socket
+        self._socket = None  # first: another thread may be waiting for a reply
+        if opened is not None:
+            opened.close()
 
     def __enter__(self) -> Self:
         return self
@@ -221,7 +221,7 @@ def open_socket(
             open_timeout=open_timeout,
             ping_timeout=pong_timeout,
             proxy=None,
-        )
+        ).__enter__()
     except ValueError as error:  # a redirect, for a socket that is open
         raise UserError(f"The server at {name} is elsewhere: {without_user(str(error))}") from None
     except InvalidHandshake as error:

@@ -9,7 +9,7 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,6 @@ class ServerStats:
         self._begun = time.monotonic()
         self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=WINDOW))
         self.counts: Counter[str] = Counter()
-        self.connections = 0
 
     def took(self, kind: str, seconds: float) -> None:
         self.counts[kind] += 1
@@ -49,29 +48,29 @@ class ServerStats:
             "max": round(max(seconds) * 1e3, 2),
         }
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self, n_clients: int) -> dict[str, Any]:
         mean_batch = None
         if self.counts["batch"]:
             mean_batch = round(self.counts["batched"] / self.counts["batch"], 2)
         return {
             "uptime_s": round(time.monotonic() - self._begun, 1),
-            "connections": self.connections,
+            "connections": n_clients,
             "counts": dict(sorted(self.counts.items())),
             "mean_batch": mean_batch,
             "latency_ms": {kind: self.percentiles(kind) for kind in sorted(self._seconds)},
         }
 
-    def line(self) -> str:
+    def line(self, n_clients: int) -> str:
         """One line for the log."""
         times = "none yet"
         infer = self.percentiles("infer")
         if infer:
             times = f"p50 {infer['p50']:.0f} ms, p95 {infer['p95']:.0f} ms"
-        mean = self.snapshot()["mean_batch"]
+        mean = self.snapshot(n_clients)["mean_batch"]
         if mean:
             times += f", {mean} to a batch"
         return (
-            f"{counted(self.connections, 'client')} · {counted(self.counts['infer'], 'inference')}"
+            f"{counted(n_clients, 'client')} · {counted(self.counts['infer'], 'inference')}"
             f" ({times}) · "
             f"{counted(self.counts['refused'], 'request')} refused, {self.counts['failed']} failed"
         )
@@ -88,8 +87,10 @@ class _Waiting[T]:
     """
 
     work: T
-    future: asyncio.Future
     pieces: int = 1
+    future: asyncio.Future = field(
+        default_factory=lambda: asyncio.get_running_loop().create_future()
+    )
 
 
 class Engine:
@@ -119,7 +120,6 @@ class Engine:
         )
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
-        self._readers = ThreadPoolExecutor(2, "decode")
         self._task: asyncio.Task[None] | None = None
 
     async def warm_up(self, n_frames: int) -> None:
@@ -140,54 +140,51 @@ class Engine:
             acting.future.cancel()
         for reading in self.scheduler.reading:
             reading.future.cancel()
-        self._readers.shutdown(wait=False)
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
         """The next chunk [h, w] of an episode, in one batch with all episodes that wait at the same
         time.
         """
-        chunk: np.ndarray = await self._join(self.scheduler.acting, episode)
+        waiting = _Waiting(episode)
+        self.scheduler.acting.append(waiting)
+        self._wake.set()
+        chunk: np.ndarray = await waiting.future
         return chunk
 
     async def run(self, steps: Iterator[None], pieces: int = 1) -> None:
         """Run an iterator that pauses between its `pieces` in the policy's thread, with others'
         work in the pauses.
         """
-        await self._join(self.scheduler.reading, steps, pieces)
+        waiting = _Waiting(steps, pieces)
+        self.scheduler.reading.append(waiting)
+        self._wake.set()
+        await waiting.future
 
     async def call[T](self, function: Callable[[], T]) -> T:
         """Run something short in the policy's thread, at once."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
-
-    async def decode[T](self, function: Callable[[], T]) -> T:
-        """Run something that decodes a large message, beside the policy's thread."""
-        return await asyncio.get_running_loop().run_in_executor(self._readers, function)
-
-    async def _join[T](self, queue: deque[_Waiting[T]], work: T, pieces: int = 1) -> np.ndarray:
-        future: asyncio.Future[np.ndarray] = asyncio.get_running_loop().create_future()
-        queue.append(_Waiting(work, future, pieces))
-        self._wake.set()
-        return await future
 
     async def _work(self) -> None:
         while True:
             await self._wake.wait()
             self._wake.clear()
             while self.scheduler:
-                await self._run_scheduler()
+                await self._run_round()
 
-    async def _run_scheduler(self) -> None:
+    async def _run_round(self) -> None:
+        """A function of its own, so that nothing holds the last episode while nothing waits."""
         for step in self.scheduler.next_steps():
             if isinstance(step, Read):
                 await self._piece(step.work)
                 await asyncio.sleep(0)  # clients whose frames are in request actions now
             elif isinstance(step, Act):
-                await self._batch([waiting for waiting in step.batch if not waiting.future.done()])
+                await self._batch(step.batch)
             else:
                 await self._prepare(step.work)
 
     async def _batch(self, batch: list[_Waiting[Episode]]) -> None:
+        batch = [waiting for waiting in batch if not waiting.future.done()]
         if not batch:
             return
         begun = time.perf_counter()

@@ -10,6 +10,7 @@ import hmac
 import logging
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -23,7 +24,7 @@ from mme_vla.serving.codec import pack, unpack
 from mme_vla.serving.engine import Engine, ServerStats
 from mme_vla.serving.requests import Request as PolicyRequest
 from mme_vla.serving.requests import RequestReader
-from mme_vla.serving.session import BusyError, HttpSessions, NoEpisodeError, Session
+from mme_vla.serving.session import HttpSessions, NoEpisodeError, Session
 from mme_vla.serving.settings import Limits, ServeSettings, listen
 from mme_vla.utils import to_json
 
@@ -101,8 +102,14 @@ class PolicyServer:
         identity = identify_policy(policy, name or None, source)
         self.metadata["identity"] = to_json(asdict(identity))
         self.port = settings.port
+        self._decoders = ThreadPoolExecutor(2, "decode")  # more would delay the event loop
         self._background: list[asyncio.Task[None]] = []
         self._uvicorn: uvicorn.Server | None = None
+
+    @property
+    def n_clients(self) -> int:
+        """Websockets, HTTP requests in progress, and HTTP sessions between two requests."""
+        return len(self.places.taken) + len(self.sessions.silent())
 
     async def start(self) -> None:
         begun = time.perf_counter()
@@ -166,6 +173,7 @@ class PolicyServer:
             for protocol in list(server.server_state.connections):
                 protocol.transport.abort()
         self.sessions.entries.clear()
+        self._decoders.shutdown(wait=False)
         await self.engine.stop()
 
     async def _log_regularly(self) -> None:
@@ -173,7 +181,7 @@ class PolicyServer:
         while True:
             await asyncio.sleep(self.settings.log_every_s)
             if (total := self.stats.counts.total()) != before:
-                logger.info("%s", self.stats.line())
+                logger.info("%s", self.stats.line(self.n_clients))
             before = total
 
     async def _end_silent(self, server: uvicorn.Server) -> None:
@@ -185,18 +193,15 @@ class PolicyServer:
     # Routes.
 
     def _app(self) -> ASGIApp:
-        handlers = {
-            "/healthz": self.healthz,
-            "/metadata": self.describe,
-            "/stats": self.show_stats,
-            "/reset": self.infer,
-            "/infer": self.infer,
-        }
-        routes: list[Route | WebSocketRoute] = [
-            Route(path, handler, methods=[METHODS[path]]) for path, handler in handlers.items()
+        routes = [
+            Route("/healthz", self.healthz),
+            Route("/metadata", self.describe),
+            Route("/stats", self.show_stats),
+            Route("/reset", self.infer, methods=["POST"]),
+            Route("/infer", self.infer, methods=["POST"]),
+            WebSocketRoute("/{path:path}", self.websocket),
         ]
-        routes.append(WebSocketRoute("/{path:path}", self.websocket))
-        refused = (HTTPException, UserError, BusyError)
+        refused = (HTTPException, UserError)
         app = Starlette(routes=routes, exception_handlers=dict.fromkeys(refused, self._refuse))
 
         async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
@@ -207,10 +212,12 @@ class PolicyServer:
             try:
                 if refusal is None:
                     await app(scope, receive, send)
-                elif scope["type"] == "http":
-                    await refusal(scope, receive, send)
                 else:
-                    await WebSocket(scope, receive, send).send_denial_response(refusal)
+                    self.stats.counts["refused"] += 1
+                    if scope["type"] == "http":
+                        await refusal(scope, receive, send)
+                    else:
+                        await WebSocket(scope, receive, send).send_denial_response(refusal)
             finally:
                 seconds = KEEP_ALIVE_S
                 if refusal or scope["path"] in OPEN or scope["type"] == "websocket":
@@ -224,7 +231,6 @@ class PolicyServer:
         headers = Headers(scope=scope)
         path = scope["path"] if scope["type"] == "http" else None
         if "origin" in headers and path != "/healthz":
-            self.stats.counts["refused"] += 1
             return PlainTextResponse("Pages in a browser are not served.\n", 403)
         if path in OPEN or self.settings.api_key is None:
             return None
@@ -233,7 +239,6 @@ class PolicyServer:
         right = hmac.compare_digest(key.strip().encode(), self.settings.api_key.encode())
         if right and scheme.lower() == "api-key":
             return None
-        self.stats.counts["refused"] += 1
         return PlainTextResponse("Send the header Authorization: Api-Key <key>.\n", 401)
 
     async def _refuse(self, request: Request, error: Exception) -> Response:
@@ -241,11 +246,7 @@ class PolicyServer:
         self.stats.counts["refused"] += 1
         if not isinstance(error, HTTPException):
             logger.info("%s: refused: %s", _client(request), error)
-            status = 400
-            if isinstance(error, NoEpisodeError):
-                status = 409
-            elif isinstance(error, BusyError):
-                status = 503
+            status = 409 if isinstance(error, NoEpisodeError) else 400
             return PlainTextResponse(f"{error}\n", status)
         path = request.url.path
         text = error.detail
@@ -264,7 +265,7 @@ class PolicyServer:
         return Response(pack(self.metadata), media_type=MSGPACK)
 
     async def show_stats(self, _: Request) -> Response:
-        return JSONResponse(self.stats.snapshot())
+        return JSONResponse(self.stats.snapshot(self.n_clients))
 
     async def infer(self, request: Request) -> Response:
         """Reply to a request of a session that begins with `reset` or `is_first_step`."""
@@ -287,7 +288,7 @@ class PolicyServer:
             finally:
                 leaving.cancel()
             return Response(pack(reply), media_type=MSGPACK)
-        except (HTTPException, UserError, BusyError):
+        except (HTTPException, UserError):
             raise
         except Exception as error:
             self.stats.counts["failed"] += 1
@@ -335,7 +336,8 @@ class PolicyServer:
         """Decode and check a message; a large one beside the event loop."""
         if len(data) <= SMALL:
             return self.reader.parse(unpack(data))
-        return await self.engine.decode(lambda: self.reader.parse(unpack(data)))
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._decoders, lambda: self.reader.parse(unpack(data)))
 
     # Websocket.
 
@@ -488,13 +490,11 @@ class Places:
             self.end(longest, FULL)
         place = Place(address, socket)
         self.taken.append(place)
-        self._stats.connections = len(self.taken)
         return place
 
     def leave(self, place: Place) -> None:
         if place in self.taken:
             self.taken.remove(place)
-        self._stats.connections = len(self.taken)
 
     def waiting(self) -> list[Place]:
         """Places of clients that wait for no reply."""

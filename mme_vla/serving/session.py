@@ -36,8 +36,6 @@ class Session:
         before it changed anything, and not after one that failed half way.
     """
 
-    intact = True
-
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
         self._engine = engine
         self._settings = settings
@@ -46,10 +44,12 @@ class Session:
         self._begin()
 
     def _begin(self) -> None:
+        self.intact = False  # where memory runs out, the former episode does not go on
         self.episode = self._engine.policy.start_episode("", seed=self._seed)
         self._exec_start = 0
         self._n_frames_at_action: int | None = None
         self._sizes: dict[tuple[str, str], tuple[int, ...]] = {}  # by kind of message and camera
+        self.intact = True
 
     async def respond(self, request: Request, begun: float) -> dict[str, Any]:
         """Do what a request asks and return the reply as the protocol has it, not yet packed.
@@ -217,8 +217,8 @@ class Session:
             )
 
     def _check_states(self, states: np.ndarray) -> None:
-        stats = self._engine.policy.require_processor().stats
-        check_reach(states, None if stats is None else stats.state, "a state")
+        stats = self._engine.policy.require_processor().require_stats()
+        check_reach(states, stats.state, "a state")
 
     def _check_sizes(self, kind: str, views: Mapping[str, Sequence[np.ndarray]]) -> None:
         """Make sure that a camera's images have the size that they had when the episode began.
@@ -254,10 +254,6 @@ LOST = (
 )
 
 
-class BusyError(Exception):
-    """No session can make place for a new one."""
-
-
 @dataclass(eq=False)
 class SessionEntry:
     """A session of an HTTP client.
@@ -280,71 +276,54 @@ class HttpSessions:
         self._settings = settings
         self.entries: dict[Name, SessionEntry] = {}
 
+    def silent(self) -> list[Name]:
+        """Sessions between two requests, the longest silent one first."""
+        names = [name for name, entry in self.entries.items() if not entry.requests]
+        return sorted(names, key=lambda name: self.entries[name].used)
+
     async def respond(
         self, name: Name, request: Request, begun: float, has_left: Callable[[], bool]
     ) -> dict[str, Any]:
         """Reply to a request of a session, after those of the same session that came before.
+
+        A new session replaces the longest silent one where there is no other place. There is a
+        silent one: the requests at work, this one included, are at most `limits.connections`.
 
         Args:
             has_left: whether the client does not wait for the reply any more. It cannot know
                 whether its frames were taken and may send them again: its episode ends.
 
         Raises:
-            NoEpisodeError: the session has ended, or never began.
-            BusyError: there is no place for a new session.
+            NoEpisodeError: the episode has ended, or never began.
         """
-        entry = self.find(name, request)
+        begins = isinstance(request, Reset) or (
+            isinstance(request, Infer) and request.first is True
+        )
+        if name not in self.entries:
+            require(begins, LOST, NoEpisodeError)
+            if len(self.entries) >= self._settings.limits.connections:
+                del self.entries[self.silent()[0]]
+                self._engine.stats.counts["let_go"] += 1
+            self.entries[name] = SessionEntry(Session(self._engine, self._settings))
+        entry = self.entries[name]
         entry.requests += 1
         try:
             async with entry.lock:
-                if self.entries.get(name) is entry:
-                    reply = await entry.session.respond(request, begun)
-                    if not _begins(request) and has_left():
-                        self.drop(name, entry)
-                    return reply
-            # A request before this one failed and ended the session.
-            if _begins(request):
-                return await self.respond(name, request, begun, has_left)
-            raise NoEpisodeError(LOST)
-        except Exception as error:
-            if not isinstance(error, UserError) or not entry.session.intact:
-                self.drop(name, entry)
-            raise
+                # A request before this one may have failed and ended the episode.
+                require(begins or entry.session.intact, LOST, NoEpisodeError)
+                reply = await entry.session.respond(request, begun)
+                if not begins and has_left():
+                    entry.session.intact = False
+                return reply
         finally:
             entry.requests -= 1
             entry.used = time.monotonic()
-
-    def find(self, name: Name, request: Request) -> SessionEntry:
-        """The session of that name.
-
-        A new one replaces the longest silent one where there is no other place.
-        """
-        if name in self.entries:
-            return self.entries[name]
-        if not _begins(request):
-            raise NoEpisodeError(LOST)
-        if len(self.entries) >= self._settings.limits.connections:
-            silent = [known for known, entry in self.entries.items() if not entry.requests]
-            if not silent:
-                raise BusyError(f"{len(self.entries)} sessions are at work, as many as fit here.")
-            del self.entries[min(silent, key=lambda known: self.entries[known].used)]
-            self._engine.stats.counts["let_go"] += 1
-        self.entries[name] = SessionEntry(Session(self._engine, self._settings))
-        return self.entries[name]
-
-    def drop(self, name: Name, entry: SessionEntry | None = None) -> None:
-        """End a session; where `entry` is given, only if the name still means that one."""
-        if entry is None or self.entries.get(name) is entry:
-            self.entries.pop(name, None)
+            if not entry.session.intact and not entry.requests:
+                self.entries.pop(name, None)
 
     def forget_silent(self) -> None:
         """Free the memory of sessions that have been silent for `limits.idle_s`."""
         oldest = time.monotonic() - self._settings.limits.idle_s
-        for name, entry in list(self.entries.items()):
-            if entry.used < oldest and not entry.requests:
+        for name in self.silent():
+            if self.entries[name].used < oldest:
                 del self.entries[name]
-
-
-def _begins(request: Request) -> bool:
-    """Whether a request begins an episode, whatever was before it."""
-    return isinstance(request, Reset) or (isinstance(request, Infer) and request.first is True)

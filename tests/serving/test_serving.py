@@ -148,7 +148,7 @@ def test_an_episodes_memory_is_freed_when_its_client_goes(policy):
                     client.close()
                 else:
                     client._socket.socket.shutdown(socket.SHUT_RDWR)
-                wait_until(lambda: served.server.stats.connections == 0)
+                wait_until(lambda: served.server.n_clients == 0)
         finally:
             del policy.start_episode
         assert len(born) == 6, (
@@ -166,7 +166,7 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
         )
         assert video.begun.wait(30)
         client._socket.socket.shutdown(socket.SHUT_RDWR)
-        wait_until(lambda: served.server.stats.connections == 0)
+        wait_until(lambda: served.server.n_clients == 0)
         assert video.over.wait(30)
         with served.client() as other:
             by_challenge(other, course()[:1])
@@ -353,7 +353,7 @@ def test_a_full_server_says_so_and_has_capacity_again_later(policy):
         with pytest.raises(UserError, match="full"):
             served.client()
         busy._socket.socket.shutdown(socket.SHUT_RDWR)
-        wait_until(lambda: served.server.stats.connections == 0)
+        wait_until(lambda: served.server.n_clients == 0)
         served.client().close()
 
 

@@ -26,7 +26,7 @@ from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import UserError
 from mme_vla.serving import Client, Limits, pack, unpack
 from mme_vla.serving.requests import AddBuffer, Reset
-from mme_vla.serving.session import BusyError, NoEpisodeError
+from mme_vla.serving.session import NoEpisodeError
 
 LOGGER = logging.getLogger(__name__)
 
@@ -156,7 +156,7 @@ def slow_post(served: Served) -> socket.socket:
 def test_bodies_that_arrive_slowly_hold_no_place(policy):
     with Served(policy, limits=Limits(connections=2)) as served:
         bodies = [slow_post(served) for _ in range(2)]
-        wait_until(lambda: served.server.stats.connections == 2)
+        wait_until(lambda: served.server.n_clients == 2)
         assert served.busy == 0
         with served.client() as client, served.client() as other:
             assert client.reset() and other.reset()
@@ -260,17 +260,18 @@ def test_a_new_session_takes_the_place_of_the_longest_silent(served):
     sessions, settings = served.server.sessions, served.server.settings
     sessions.entries.clear()
     names = [("127.0.0.1", str(i)) for i in range(settings.limits.connections)]
-    sessions_ = {name: sessions.find(name, Reset()) for name in names}
-    sessions_[names[0]].requests = 1  # at work
-    sessions_[names[3]].used -= 100
     newcomer = ("127.0.0.1", "new")
-    sessions.find(newcomer, Reset())
+
+    async def begin():
+        for name in names:
+            await sessions.respond(name, Reset(), 0.0, stays)
+        sessions.entries[names[0]].requests = 1  # at work
+        sessions.entries[names[0]].used -= 200
+        sessions.entries[names[3]].used -= 100
+        await sessions.respond(newcomer, Reset(), 0.0, stays)
+
+    served.on_loop(begin())
     assert set(sessions.entries) == {*names, newcomer} - {names[3]}
-    for name in names:
-        sessions_[name].requests = 1
-    sessions.entries[newcomer].requests = 1
-    with pytest.raises(BusyError, match="at work"):
-        sessions.find(("127.0.0.1", "another"), Reset())
     sessions.entries.clear()
 
 
@@ -278,21 +279,20 @@ def test_a_request_that_waited_does_not_continue_with_an_episode_that_failed_mea
     sessions, name = served.server.sessions, ("127.0.0.1", "twice")
 
     async def meet():
-        first = sessions.find(name, Reset())
-        await first.lock.acquire()
-        waiting = asyncio.ensure_future(
-            sessions.respond(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0, stays)
-        )
+        await sessions.respond(name, Reset(), 0.0, stays)
+        entry = sessions.entries[name]
+        await entry.lock.acquire()
+        buffer = AddBuffer([], 0, np.zeros((0, 8), np.float32))
+        waiting = asyncio.ensure_future(sessions.respond(name, buffer, 0.0, stays))
         await asyncio.sleep(0)
-        assert first.requests == 1
-        sessions.drop(name)  # as an error of the request before it does
-        second = sessions.find(name, Reset())
-        first.lock.release()
+        assert entry.requests == 1
+        entry.session.intact = False  # as an error of the request before it leaves it
+        entry.lock.release()
         with pytest.raises(NoEpisodeError, match="begin the episode again"):
             await waiting
-        return sessions.entries.pop(name) is second
 
-    assert served.on_loop(meet())
+    served.on_loop(meet())
+    assert name not in sessions.entries
 
 
 def test_frames_are_not_taken_twice_from_a_client_that_gave_up_and_sends_them_again(policy):
@@ -315,16 +315,27 @@ def test_a_reset_that_waited_begins_an_episode_that_later_requests_find(served):
     sessions, name = served.server.sessions, ("127.0.0.1", "again")
 
     async def meet():
-        first = sessions.find(name, Reset())
-        await first.lock.acquire()
+        await sessions.respond(name, Reset(), 0.0, stays)
+        entry = sessions.entries[name]
+        await entry.lock.acquire()
         waiting = asyncio.ensure_future(sessions.respond(name, Reset(), 0.0, stays))
         await asyncio.sleep(0)
-        sessions.drop(name)  # as an error of the request before it does
-        first.lock.release()
+        entry.session.intact = False  # as an error of the request before it leaves it
+        entry.lock.release()
         assert (await waiting)["reset_finished"]
-        return sessions.entries.pop(name, first) is first
+        return sessions.entries.pop(name).session.intact
 
-    assert not served.on_loop(meet())
+    assert served.on_loop(meet())
+
+
+def test_sessions_between_two_requests_count_as_clients(policy):
+    with Served(policy) as served:
+        for name in ("ours", "theirs"):
+            by_http(served, course()[:1], X_Session=name)
+        with served.client():
+            stats = json.loads(ask(served, "GET", "/stats")[2])
+    assert stats["connections"] == 3
+    assert served.server.stats.line(served.server.n_clients).startswith("0 clients")
 
 
 @pytest.mark.parametrize(

@@ -54,10 +54,10 @@ def test_a_silent_websocket_is_closed_and_its_episode_freed(policy):
         client, steady = served.client(), served.client()
         client.infer(challenge(*course()[0], first=True))
         until = time.monotonic() + 30
-        while served.server.stats.connections > 1 and time.monotonic() < until:
+        while served.server.n_clients > 1 and time.monotonic() < until:
             steady.reset()
             time.sleep(0.05)
-        assert served.server.stats.connections == 1
+        assert served.server.n_clients == 1
         with pytest.raises(ConnectionError, match=r"1001.*silent"):
             client.reset()
         assert steady.reset()

@@ -18,6 +18,7 @@ from mme_vla.errors import UserError, brief
 from mme_vla.serving.client import (
     LARGEST_REPLY,
     Client,
+    ConnectionClosed,
     closed,
     decoded_map,
     key_header,
@@ -187,8 +188,6 @@ class HarnessConnection:
 
     def send(self, kind: str, payload: Mapping[str, Any]) -> int:
         """Send a message that needs no reply; return its number."""
-        from websockets.exceptions import ConnectionClosed
-
         self._sequence += 1
         message = {
             "type": kind,
@@ -214,8 +213,6 @@ class HarnessConnection:
 
         An error of an earlier message, such as the beginning of the episode, counts as well.
         """
-        from websockets.exceptions import ConnectionClosed
-
         try:
             data = self._socket.recv(self._timeout)
         except TimeoutError:
