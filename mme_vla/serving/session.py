@@ -153,10 +153,17 @@ class Session:
             " observation is one frame: send all frames since the last request in lists"
             " (<camera>_rgb_list).",
         )
-        if n_observed == 0 and policy.memory is not None:
-            raise UserError(
+        if policy.memory is not None:
+            require(
+                n_observed,
                 "This policy remembers past frames: send them with add_buffer, the current one"
-                " included."
+                " included.",
+            )
+            require(
+                self._exec_start < n_observed,
+                f"exec_start_idx={self._exec_start}: it is one of the {n_observed} frames of the"
+                " episode so far, and the current frame would be one of the video. Reset and begin"
+                " the episode again.",
             )
         reads_actions = processor.prompt_spec.past_actions > 0
         if reads_actions and self._n_frames_at_action == n_observed:

@@ -266,9 +266,14 @@ def test_a_run_does_not_go_on_with_another_policy_at_the_same_address(
     with Served(serving_policy("pi05")) as served:
         policy = connect(f"ws://127.0.0.1:{served.server.port}")
         run(policy, tmp_path, PICK[:1])
-        served.server.metadata["identity"]["composition"] = "another"
-        with pytest.raises(UserError, match=r"another policy than at the start .* \(identity"):
-            run(policy, tmp_path, PICK[:2])
+        first = served.server.metadata
+        for key, other in (
+            ("identity", {**first["identity"], "composition": "another"}),
+            ("sample_steps", first["sample_steps"] + 1),  # restarted with another flow_steps
+        ):
+            served.server.metadata = first | {key: other}
+            with pytest.raises(UserError, match=rf"another policy than at the start .* \({key} in"):
+                run(policy, tmp_path, PICK[:2])
         policy.close()
     assert len(read_records(tmp_path / "episodes.jsonl")) == 1
 

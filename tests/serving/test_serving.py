@@ -234,6 +234,19 @@ def test_the_client_chooses_the_noise_of_an_episode(served):
     assert not np.allclose(chunks[0], chunks[2])
 
 
+def test_the_current_frame_is_not_of_the_video(served):
+    front, wrist, state = course()[0]
+    current = observation(front[-1], wrist[-1], state[-1])
+    with served.client() as client:
+        client.add_buffer(front, state, exec_start=len(front))
+        with pytest.raises(UserError, match="exec_start_idx=10: it is one of the 10 frames"):
+            client.infer(current)
+        client.reset()
+        client.add_buffer(front[:4], state[:4], exec_start=9)  # a video may come in parts
+        client.add_buffer(front[4:], state[4:])
+        client.infer(current)
+
+
 def test_a_refused_request_leaves_the_episode_as_it_was(policy):
     """The actions are those of an episode in which the refused requests never came."""
     parts = course()[:2]

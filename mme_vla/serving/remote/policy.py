@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, cast
 from weakref import WeakSet
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode, Failure
 from mme_vla.policy.identity import PolicyIdentity
@@ -39,6 +39,8 @@ from mme_vla.serving.remote.protocols import (
 from mme_vla.serving.remote.settings import ServerChoice
 from mme_vla.utils import safe_name
 
+DECISIVE = ("identity", "robot", "horizon", "execute", "subgoal", "sample_steps")
+"""What metadata of this library's server say of a policy, all of which its records depend on."""
 LARGEST_ACTION = 1e4
 """Largest size of a number of an action: radians, metres and shares are far below."""
 _LONGEST_METADATA = 4000  # characters of a server's metadata, in a receipt
@@ -234,9 +236,8 @@ class RemotePolicy(Policy):
                 f"{error} Its protocol is another than {name}, or it is still loading: set"
                 " protocol=… or connection.open_s=…"
             ) from None
-        self.metadata = first.metadata
         first.close()
-        metadata = ServerMetadata.of(self.metadata)
+        metadata = self._metadata = ServerMetadata.of(first.metadata)
         self.protocol.describe(metadata)
 
         robot = self.protocol.robot
@@ -258,7 +259,7 @@ class RemotePolicy(Policy):
         self._server: dict[str, Any] = {
             "address": choice.server,
             "protocol": name,
-            "metadata": brief(self.metadata, _LONGEST_METADATA),
+            "metadata": brief(first.metadata, _LONGEST_METADATA),
         }
         self.info = PolicyInfo(
             sample_steps=count_of(metadata.sample_steps) or 1,
@@ -305,10 +306,7 @@ class RemotePolicy(Policy):
             steps is None,
             "flow_steps=…: a server chooses its own; leave it out, or set it where it is started.",
         )
-        remote: list[RemoteEpisode] = []
-        for episode in episodes:
-            assert isinstance(episode, RemoteEpisode)
-            remote.append(episode)
+        remote = cast(Sequence[RemoteEpisode], episodes)
         futures = [self._threads.submit(self._request, episode) for episode in remote]
         try:
             wait(futures)
@@ -360,16 +358,14 @@ class RemotePolicy(Policy):
 
         def begin() -> Connection:
             connection = self.protocol.open()
-            identity = ServerMetadata.of(connection.metadata).identity
-            if (
-                self.protocol.name == "mme_vla"
-                and identity != ServerMetadata.of(self.metadata).identity
-            ):
+            now = ServerMetadata.of(connection.metadata)
+            differ = [key for key in DECISIVE if getattr(now, key) != getattr(self._metadata, key)]
+            if self.protocol.name == "mme_vla" and differ:
                 connection.close()
                 raise UserError(
                     f"{self._server['address']} serves another policy than at the start of this run"
-                    " (identity in its metadata). Serve the first again and repeat the command, or"
-                    " choose another output."
+                    f" ({listed(differ)} in its metadata). Serve the first again and repeat the"
+                    " command, or choose another output."
                 )
             try:
                 self.protocol.begin(connection, frames)
