@@ -27,10 +27,9 @@ except ImportError as error:  # the extra is missing: say which
 
 def pack(message: Any) -> bytes:
     try:
-        packed = msgpack.packb(message, default=encode)
+        packed: bytes = msgpack.packb(message, default=encode)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"This message cannot be encoded: {error}") from error
-    assert isinstance(packed, bytes)
     return packed
 
 

@@ -120,7 +120,7 @@ class Engine:
         )
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
-        self._task: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[None]
 
     async def warm_up(self, n_frames: int) -> None:
         """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
@@ -132,10 +132,9 @@ class Engine:
 
     async def stop(self) -> None:
         """Stop after the piece that is running; what still waits is cancelled."""
-        if self._task is not None:
-            self._task.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._task
+        self._task.cancel()
+        with suppress(asyncio.CancelledError):
+            await self._task
         for acting in self.scheduler.acting:
             acting.future.cancel()
         for reading in self.scheduler.reading:

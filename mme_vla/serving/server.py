@@ -104,7 +104,7 @@ class PolicyServer:
         self.port = settings.port
         self._decoders = ThreadPoolExecutor(2, "decode")  # more would delay the event loop
         self._background: list[asyncio.Task[None]] = []
-        self._uvicorn: uvicorn.Server | None = None
+        self._uvicorn: uvicorn.Server
 
     @property
     def n_clients(self) -> int:
@@ -117,24 +117,10 @@ class PolicyServer:
         logger.info("warmed up in %.1f s", time.perf_counter() - begun)
         bound = listen(self.settings.host, self.settings.port)
         self.engine.start()
-        config = self._config()
-        config.load()
-        server = self._uvicorn = uvicorn.Server(config)
-        # `serve()` would take over the signals of the process.
-        server.lifespan = config.lifespan_class(config)
-        await server.startup(sockets=[bound])
-        self.port = bound.getsockname()[1]
-        loop = asyncio.get_running_loop()
-        self._background = [
-            loop.create_task(self._log_regularly()),
-            loop.create_task(self._end_silent(server)),
-        ]
-
-    def _config(self) -> uvicorn.Config:
         limits = self.settings.limits
         # No `limit_concurrency`: it would count clients without the key, who could so lock out
         # those who have it.
-        return uvicorn.Config(
+        config = uvicorn.Config(
             self._app(),
             http="h11",
             ws="websockets-sansio",
@@ -152,6 +138,17 @@ class PolicyServer:
             server_header=False,
             date_header=False,
         )
+        config.load()
+        server = self._uvicorn = uvicorn.Server(config)
+        # `serve()` would take over the signals of the process.
+        server.lifespan = config.lifespan_class(config)
+        await server.startup(sockets=[bound])
+        self.port = bound.getsockname()[1]
+        loop = asyncio.get_running_loop()
+        self._background = [
+            loop.create_task(self._log_regularly()),
+            loop.create_task(self._end_silent(server)),
+        ]
 
     async def stop(self) -> None:
         """Refuse new clients, finish the requests that are running, close every connection with a
@@ -160,18 +157,18 @@ class PolicyServer:
         self.places.stopping = True
         for task in self._background:
             task.cancel()
-        if (server := self._uvicorn) is not None:
-            for listener in server.servers:
-                listener.close()
-            for place in self.places.waiting():
-                self.places.end(place, STOPPING)
-            with suppress(TimeoutError):
-                async with asyncio.timeout(self.settings.limits.stop_s):
-                    while self.places.taken or self.places.closing:
-                        await asyncio.sleep(0.02)
-            await server.shutdown()
-            for protocol in list(server.server_state.connections):
-                protocol.transport.abort()
+        server = self._uvicorn
+        for listener in server.servers:
+            listener.close()
+        for place in self.places.waiting():
+            self.places.end(place, STOPPING)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(self.settings.limits.stop_s):
+                while self.places.taken or self.places.closing:
+                    await asyncio.sleep(0.02)
+        await server.shutdown()
+        for protocol in list(server.server_state.connections):
+            protocol.transport.abort()
         self.sessions.entries.clear()
         self._decoders.shutdown(wait=False)
         await self.engine.stop()
@@ -275,7 +272,7 @@ class PolicyServer:
             raise HTTPException(503, BUSY)
         try:
             body = await self._body(request)
-            if place.ended:
+            if place not in self.places.taken:
                 raise HTTPException(503, FULL)
             place.waiting_since = None
             begun = time.perf_counter()
@@ -377,7 +374,7 @@ class PolicyServer:
                 # Reading continues while the policy computes, so that a client that leaves is
                 # noticed.
                 coming = asyncio.ensure_future(socket.receive())
-                if place.ended:  # the client sent this before it knew
+                if place not in self.places.taken:  # the client sent this before it knew
                     continue
                 place.waiting_since = None
                 computing = asyncio.ensure_future(self._reply(session, event, place))
@@ -440,13 +437,11 @@ class Place:
     socket: a websocket, which has an episode of its own; None for HTTP.
     waiting_since: when the server began to wait for the client (`time.monotonic()`); None while
         the client waits for a reply.
-    ended: the server has ended it.
     """
 
     address: Any
     socket: WebSocket | None = None
     waiting_since: float | None = field(default_factory=time.monotonic)
-    ended: bool = False
 
     @property
     def name(self) -> str:
@@ -467,6 +462,7 @@ class Places:
         self._limits = limits
         self._stats = stats
         self.taken: list[Place] = []
+        """A place that the server has ended is not among them any more."""
         self.closing: set[asyncio.Task[None]] = set()
         """Closing frames that are being sent."""
         self.stopping = False
@@ -493,8 +489,7 @@ class Places:
         return place
 
     def leave(self, place: Place) -> None:
-        if place in self.taken:
-            self.taken.remove(place)
+        self.taken = [other for other in self.taken if other is not place]
 
     def waiting(self) -> list[Place]:
         """Places of clients that wait for no reply."""
@@ -502,7 +497,6 @@ class Places:
 
     def end(self, place: Place, reason: str) -> None:
         """Close a websocket with the reason, and an HTTP connection without one."""
-        place.ended = True
         self.leave(place)
         if place.socket is None:
             self.deadlines[place.address] = time.monotonic()

@@ -264,20 +264,19 @@ class RobommeProtocol(ServerProtocol):
     shares_memory = True
 
     def act(self, connection: Connection, frames: NewFrames) -> dict[str, Any]:
-        if not len(frames.states):
-            return connection.request(self.observation(frames))
-        images = np.stack(list(frames.views[self.robot.memory_camera]))
-        added = connection.request({
-            "add_buffer": True,
-            "images": images[:, None],
-            "state": frames.states,
-            "exec_start_idx": frames.n_video,
-        })  # fmt: skip
-        if added.get("add_buffer_finished") is not True:
-            raise UserError(
-                f"The server's reply is malformed: {brief(added)} after frames, which needs"
-                " add_buffer_finished."
-            )
+        if len(frames.states):
+            images = np.stack(list(frames.views[self.robot.memory_camera]))
+            added = connection.request({
+                "add_buffer": True,
+                "images": images[:, None],
+                "state": frames.states,
+                "exec_start_idx": frames.n_video,
+            })  # fmt: skip
+            if added.get("add_buffer_finished") is not True:
+                raise UserError(
+                    f"The server's reply is malformed: {brief(added)} after frames, which needs"
+                    " add_buffer_finished."
+                )
         return connection.request(self.observation(frames))
 
 
