@@ -120,7 +120,6 @@ class Engine:
         )
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
-        self._task: asyncio.Task[None]
 
     async def warm_up(self, n_frames: int) -> None:
         """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""

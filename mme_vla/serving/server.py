@@ -101,10 +101,7 @@ class PolicyServer:
         self.metadata = _metadata(policy, settings, name, trained)
         identity = identify_policy(policy, name or None, source)
         self.metadata["identity"] = to_json(asdict(identity))
-        self.port = settings.port
         self._decoders = ThreadPoolExecutor(2, "decode")  # more would delay the event loop
-        self._background: list[asyncio.Task[None]] = []
-        self._uvicorn: uvicorn.Server
 
     @property
     def n_clients(self) -> int:

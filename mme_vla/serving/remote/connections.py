@@ -3,7 +3,6 @@
 import http.client
 import select
 import socket
-import ssl
 import threading
 import time
 import uuid
@@ -78,14 +77,9 @@ class HttpConnection:
         }
         host = address.hostname or ""
         self._path = address.path.rstrip("/")
-        self._http: http.client.HTTPConnection
+        self._http = http.client.HTTPConnection(host, address.port, timeout=open_timeout)
         if address.scheme == "https":
-            context = ssl.create_default_context()
-            self._http = http.client.HTTPSConnection(
-                host, address.port, timeout=open_timeout, context=context
-            )
-        else:
-            self._http = http.client.HTTPConnection(host, address.port, timeout=open_timeout)
+            self._http = http.client.HTTPSConnection(host, address.port, timeout=open_timeout)
         self.metadata = self._exchange("GET", "/metadata", None)
 
     def request(self, message: Mapping[str, Any]) -> dict[str, Any]:

@@ -82,10 +82,10 @@ class RemoteEpisode(Episode):
     def __init__(self, policy: "RemotePolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self._seed = seed
-        self._views: list[Mapping[str, Any]] = []
-        self._states: list[np.ndarray] = []
-        self._n_video = 0
-        self._leading: list[np.ndarray] = []
+        self._new: list[tuple[Mapping[str, Any], np.ndarray, int, np.ndarray | None]] = []
+        """Of each `observe` since the last chunk: views, states, frames of the video, and the
+        actions that led to the others, where they were given.
+        """
         self._current: Mapping[str, Any] = {}
         self.connection: Connection | None = None
 
@@ -110,43 +110,36 @@ class RemoteEpisode(Episode):
             all(len(view) == count for view in views.values()),
             "A server reads every frame, and some were not rendered: set draw=all.",
         )
-        self._views.append(views)
-        self._states.append(np.asarray(states, np.float32))
         if count:
             self._current = {name: view[-1] for name, view in views.items()}
-        self._n_video += int(np.broadcast_to(np.asarray(is_demo, bool), (count,)).sum())
-        if actions is not None:
-            self._leading.append(np.asarray(actions, np.float32))
+        n_video = int(np.broadcast_to(np.asarray(is_demo, bool), (count,)).sum())
+        self._new.append((views, np.asarray(states, np.float32), n_video, actions))
 
     def take_frames(self) -> NewFrames:
         """What was observed since the last chunk; it is not held any longer."""
-        require(self._states, "A served policy needs a new frame before each chunk.")
+        require(self._new, "A served policy needs a new frame before each chunk.")
+        views_of_parts, states, n_video, actions = zip(*self._new, strict=True)
+        self._new = []
         views = {}
-        for name in self._views[0]:
-            parts = [part[name] for part in self._views]
+        for name in views_of_parts[0]:
+            parts = [part[name] for part in views_of_parts]
             # A part without frames, of a choice that moved nothing, has no size of its own.
             views[name] = np.concatenate([part for part in parts if len(part)] or parts[:1])
-        executed = None
-        if self._leading:
-            executed = np.concatenate(self._leading)
-        frames = NewFrames(
+        leading = [part for part in actions if part is not None]
+        executed = np.concatenate(leading, dtype=np.float32) if leading else None
+        return NewFrames(
             goal=self.goal,
             subgoal=self.subgoal,
             options=self.options,
             views=views,
-            states=np.concatenate(self._states),
+            states=np.concatenate(states),
             current=self._current,
             state=self.state.numpy(),
-            n_video=self._n_video,
+            n_video=sum(n_video),
             executed=executed,
             first=self.connection is None,
             seed=self._seed,
         )
-        self._views = []
-        self._states = []
-        self._n_video = 0
-        self._leading = []
-        return frames
 
     def fail(self, failure: Failure) -> None:
         """Note that this episode cannot continue, and close its connection."""
