@@ -33,12 +33,8 @@ from mme_vla.config.composition import (
     parse,
     resolved,
 )
-from mme_vla.config.naming import (
-    expand_overrides,
-    join_memories,
-    name_composition,
-)
-from mme_vla.config.override_errors import Names, badly_spaced, bare_word, paths, unknown_option
+from mme_vla.config.naming import expand_overrides, name_composition
+from mme_vla.config.override_errors import Names, bare_word, paths, unknown_option
 from mme_vla.config.plugins import TRUST_FLAG
 from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, printable, require
@@ -72,14 +68,12 @@ def run_configured(
             if missing := sorted(OmegaConf.missing_keys(cfg)):
                 needed = " ".join(f"{key}=…" for key in missing)
                 raise UserError(f"A value is needed for {', '.join(missing)}: add {needed}")
-            join_memories(cfg)
             hydra_cfg = HydraConfig.get()
             name_composition(cfg, hydra_cfg.overrides.task)
             name = str(hydra_cfg.job.config_name)
             join_plugins(cfg, name, command_trees(), hydra_cfg.overrides.task)
+            # also in the processes of a launcher
             plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
-            if check:
-                pkgutil.resolve_name(check)(resolved(cfg))
             return main(cfg)
 
     with print_user_errors():
@@ -112,7 +106,7 @@ class NewFolders(Callback):
 
     def on_run_start(self, config: DictConfig, **_: object) -> None:
         """Called by Hydra before it makes the folder, which the composition may give its name."""
-        name_composition(join_memories(config), config.hydra.overrides.task)
+        name_composition(config, config.hydra.overrides.task)
         folder = Path(str(config.hydra.run.dir)).absolute()
         NewFolders.made = [path for path in (folder, *folder.parents) if not path.exists()]
 
@@ -153,21 +147,20 @@ def _checked_arguments(
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.config_path:
         return args  # nothing of this tree is composed
-    _check_bare_words(args.overrides, args.config_name or config_name, tree, extra)
     name = args.config_name or config_name
+    overrides = parse(
+        args.overrides, lambda words, number: bare_word(words, number, _names(name, tree, extra))
+    )
     composed = check_overrides(name, args.overrides, directory=tree, extra_dirs=extra)
-    names_output = any(word.key_or_group == "output" for word in parse(args.overrides))
+    names_output = any(override.key_or_group == "output" for override in overrides)
     for cfg in composed:
         # not resolved: Hydra knows what `${hydra:…}` means once the command runs
         output = OmegaConf.to_container(cfg).get("output")  # type: ignore[union-attr]
         if names_output and output is not None:
             check_output(str(output))
-        # What a plugin registers is known only once it is imported, which `job` does.
-        named = plugins.plugins_of(cfg, "the configuration")
-        if check and not args.cfg and not named:
-            values = resolved(cfg)
-            if not OmegaConf.missing_keys(cfg):
-                pkgutil.resolve_name(check)(values)
+        if check and not args.cfg and not OmegaConf.missing_keys(cfg):
+            plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
+            pkgutil.resolve_name(check)(resolved(cfg))
     return args
 
 
@@ -182,20 +175,6 @@ def _names(config_name: str, tree: Path, extra_dirs: Sequence[Path]) -> Names:
         groups = {group: loader.get_group_options(group) for group in loader.list_groups("")}
     groups.pop("hydra", None)
     return Names(keys, groups, options, list(shipped_checkpoints()))
-
-
-def _check_bare_words(
-    words: Sequence[str], config_name: str, tree: Path, extra_dirs: Sequence[Path]
-) -> None:
-    """Refuse words without `=`, with what they may mean."""
-    for number, word in enumerate(words):
-        mistake = badly_spaced(words, number)
-        if "=" in word or word.startswith("~"):
-            # It may only be cut where a word follows that cannot stand alone.
-            following = words[number + 1 : number + 2]
-            if mistake is None or not following or "=" in following[0]:
-                continue
-        raise UserError(mistake or bare_word(words, number, _names(config_name, tree, extra_dirs)))
 
 
 def check_overrides(

@@ -5,7 +5,7 @@ near names.
 """
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, InterpolationResolutionError
 
 from mme_vla.config import plugins
-from mme_vla.config.naming import (
-    expand_overrides,
-    join_memories,
-    name_composition,
-)
+from mme_vla.config.naming import expand_overrides, name_composition
 from mme_vla.config.override_errors import (
     COMPOSITION_ERRORS,
     FORMS,
@@ -98,18 +94,27 @@ def local_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
         base.version_base = outer_base
 
 
-def parse(overrides: Sequence[str]) -> list[Override]:
-    """Overrides under Hydra's grammar."""
+def parse(
+    overrides: Sequence[str], explain_bare: Callable[[Sequence[str], int], str] | None = None
+) -> list[Override]:
+    """Overrides under Hydra's grammar.
+
+    explain_bare: what to say of a word without `=`, called with all words and its number.
+    """
+    words = list(overrides)
     try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        parsed = OverridesParser.create().parse_overrides(words)
         for override in parsed:
             if not override.key_or_group:
                 raise OverrideParseException(str(override.input_line), "the key is missing")
     except OverrideParseException as error:
-        words = list(overrides)
         reason = None
         if error.override in words:
-            reason = badly_spaced(words, words.index(error.override))
+            number = words.index(error.override)
+            reason = badly_spaced(words, number)
+            is_bare = "=" not in error.override and not error.override.startswith("~")
+            if reason is None and is_bare and explain_bare is not None:
+                reason = explain_bare(words, number)
         if reason is None:
             detail = error.message.splitlines()[0]
             if detail.startswith("Error parsing"):  # says no more than the word itself
@@ -142,7 +147,8 @@ def compose(
     with local_hydra(trees[0], trees[1:]) as engine:
         tree = ConfigTree(engine.config_loader, config_name, parse(words))
         try:
-            cfg = join_memories(hydra.compose(config_name, words))
+            cfg = hydra.compose(config_name, words)
+            name_composition(cfg, words)
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
@@ -153,7 +159,6 @@ def compose(
             f"The section `{group}` has no name, only {', '.join(map(str, section or ()))}. Choose"
             f" one: {group}=<name>; its keys are set beside it, {group}.<key>=<value>.",
         )
-    name_composition(cfg, words)
     join_plugins(cfg, config_name, trees, words)
     return cfg
 

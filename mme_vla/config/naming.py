@@ -63,26 +63,18 @@ def expand_overrides(overrides: Iterable[str]) -> list[str]:
     return result
 
 
-def join_memories(cfg: DictConfig) -> DictConfig:
-    """A configuration in which a list of memories, as a file may give it
-    (`memory: [framesamp, ttt]`), is one memory.
-
-    Changed in place, and returned.
-    """
-    if isinstance(cfg.get("memory"), ListConfig):
-        members = OmegaConf.to_container(cfg.memory, resolve=True)
-        cfg.memory = {"name": JOINED, "budget": DEFAULT_BUDGET, "members": members}
-    return cfg
-
-
 DEFAULT_MODEL = "tokendrop_expert"
 """The model of configs/policy.yaml."""
 
 
 def name_composition(cfg: DictConfig, overrides: Iterable[str]) -> None:
-    """Give a configuration whose memory or integration the command line chose without a model a
-    name of its own, such as `rmt_modulator`: the default model is another one.
+    """Make a list of memories, as a file may give it (`memory: [framesamp, ttt]`), one memory, and
+    give a configuration whose memory or integration the command line chose without a model a name
+    of its own, such as `rmt_modulator`: the default model is another one.
     """
+    if isinstance(cfg.get("memory"), ListConfig):
+        members = OmegaConf.to_container(cfg.memory, resolve=True)
+        cfg.memory = {"name": JOINED, "budget": DEFAULT_BUDGET, "members": members}
     keys = {word.lstrip("+").partition("=")[0] for word in overrides}
     has_parts = bool(keys & {"memory", "memory.name", "integration", "integration.name"})
     if not has_parts or keys & {"model", "name"} or "name" not in cfg or cfg.name != DEFAULT_MODEL:

@@ -4,13 +4,13 @@ was expected.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
 import pytest
 
 from mme_vla.config.sections import PathText, Positive, Range, Secret, read_section
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.serving.settings import ServeSettings
 from mme_vla.training.settings import TrainSettings
 
@@ -112,13 +112,6 @@ def test_a_secret_is_not_reported() -> None:
     with pytest.raises(UserError, match="must be a text or null") as error:
         read_section(Outer, {"name": "a", "secret": [5317]})
     assert "5317" not in str(error.value)
-
-
-def test_keywords_of_a_rollout_are_its_settings() -> None:
-    settings = get_type_hints(RolloutSettings)
-    for name in ("seed", "event"):  # the function has them itself
-        del settings[name]
-    assert get_type_hints(RolloutKeywords) == settings
 
 
 def test_commands_read_their_settings_with_it() -> None:

@@ -10,7 +10,7 @@ import yaml
 from helpers import REPOSITORY
 from mme_vla import evaluate
 from mme_vla.data.cache import default_cache_root
-from mme_vla.evaluation.rollout.settings import RolloutKeywords
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.perturbation import _HOOKS, PROBE, TRAINING
 from mme_vla.serving.client import LARGEST_REPLY
 from mme_vla.subgoal.models.api import LONGEST_REPLY
@@ -27,7 +27,7 @@ def test_the_page_of_evaluation_names_the_keys_that_python_does_not_take() -> No
     page = text_of(DOCS / "evaluate" / "evaluation.md")
     (stated,) = re.findall(r"keys of `evaluate.yaml`, without `([^`]*)`", page)
     content = yaml.safe_load(text_of(CONFIGS / "evaluate.yaml"))
-    taken = {*inspect.signature(evaluate).parameters, *RolloutKeywords.__annotations__}
+    taken = {*inspect.signature(evaluate).parameters, *RolloutSettings.__annotations__}
     assert sorted(stated.split(", ")) == sorted({*content} - taken - {"defaults", "hydra"})
 
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack
+from typing import Any, NamedTuple
 
 from mme_vla.config.sections import read_section, without
 from mme_vla.envs.base import environment
@@ -30,7 +30,7 @@ from mme_vla.evaluation.rollout.environment import EpisodeFactory
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, Workload
-from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
@@ -115,7 +115,7 @@ def evaluate(
     base: Callable[..., Any] = make_env,
     show_progress: bool = True,
     event: str | Sequence[str] | None = None,
-    **settings: Unpack[RolloutKeywords],
+    **settings: Any,
 ) -> Evaluation:
     """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, TypedDict
+from typing import Any, Literal, Self
 
 from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_section
 from mme_vla.envs.base import environment
@@ -91,27 +91,6 @@ class RolloutSettings:
         if self.max_steps is not None:
             return self.max_steps
         return environment(self.env).task_limit(task, self.split)
-
-
-class RolloutKeywords(TypedDict, total=False):
-    """The settings as keywords of a function that has `seed` and `event` itself."""
-
-    split: str
-    env: str
-    max_steps: int | None
-    max_actions: int | None
-    only_possible: bool
-    execute: int | None
-    flow_steps: int | None
-    workers: int | None
-    max_batch: int
-    encode_chunk: int
-    retries: int
-    timeout_s: float
-    render: bool
-    draw: Literal["needed", "all"]
-    video: Literal["none", "all", "success", "failure"]
-    subgoal_log: bool
 
 
 def check_config(config: Mapping[str, Any]) -> None:
