@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from rich.console import Console
+
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
@@ -19,6 +21,7 @@ from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, counted, printable, require
 from mme_vla.evaluation.records import EpisodeRecord, merge
+from mme_vla.evaluation.results import ood
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate, select, setting_notes
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.compare import (
@@ -144,8 +147,6 @@ def verify(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Do what the parsed command line says."""
-    from rich.console import Console
-
     if args.demo == bool(args.runs):
         raise UserError(
             "Name files or folders of episode records, or --demo for synthetic ones (not both)."
@@ -176,23 +177,9 @@ def run(args: argparse.Namespace) -> None:
     if args.title is None:
         is_benchmark = any(task in TASK_FACTS for task in protocol.tasks)
         args.title = "RoboMME results" if is_benchmark else "Results"
-    if _check_views(args):
+    if view := _view(args):
         records, _ = select(records, protocol, args.split)
-    if args.stress:
-        curves = stress_curves(records, args.confidence, args.conflicts)
-        show_tables(
-            [stress_table(curves)],
-            stress_figures(curves),
-            "Episodes that every place of the dial has.",
-            records,
-            args,
-        )
-        return
-    if args.events:
-        show_events(records, args)
-        return
-    if args.ood:
-        show_ood(records, args)
+        show_view(view, records, args)
         return
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.made_up for record in records):
@@ -247,21 +234,24 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
     )
 
 
-def _check_views(args: argparse.Namespace) -> bool:
-    """Whether a view is asked for; refuses two at once, and options that it would leave unused."""
-    views = [f"--{name}" for name in ("stress", "events", "ood") if getattr(args, name)]
-    require(len(views) < 2, f"{' and '.join(views)}: name one of them.")
+def _view(args: argparse.Namespace) -> str:
+    """The view that is asked for, if any; refuses two at once, and options that it would leave
+    unused.
+    """
+    views = [name for name in ("stress", "events", "ood") if getattr(args, name)]
+    require(len(views) < 2, f"{' and '.join(f'--{name}' for name in views)}: name one of them.")
+    if not views:
+        return ""
     names = ["csv", "latex", "compare", "all", "brief"]
     if args.stress:
         names.append("split")  # its curves are over splits
-    default = _parser().get_default
-    unused = [f"--{name}" for name in names if getattr(args, name) != default(name)]
+    unused = [f"--{name}" for name in names if getattr(args, name) != _parser().get_default(name)]
     require(
-        not views or not unused,
-        f"{' and '.join(unused)}: not with {''.join(views)}, which takes --tasks, --episodes,"
+        not unused,
+        f"{' and '.join(unused)}: not with --{views[0]}, which takes --tasks, --episodes,"
         " --errors, --markdown and --html.",
     )
-    return bool(views)
+    return views[0]
 
 
 def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
@@ -277,60 +267,44 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     return counts.pop() if len(counts) == 1 else TEST_EPISODES
 
 
-def show_events(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
-    """Print runs with events beside their matched arms, and success over length; write both where a
-    file is named.
+def show_view(view: str, records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
+    """Print the tables of a view that have rows, and all notes, and write them, with figures, where
+    a file is named.
     """
-    curves = event_curves(records, args.confidence, args.conflicts)
-    tables = [
-        event_table(records, args.conflicts),
-        stress_table(curves, "Success over the length of events"),
-    ]
-    figures = stress_figures(curves, "control steps, frames or factor")
-    show_tables(tables, figures, "Episodes that every length has.", records, args)
-
-
-def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
-    """Print RoboMME-OOD by tier, the hard episodes, twins and extrapolation, and write them where a
-    file is named.
-    """
-    from mme_vla.evaluation.results import ood
-
     how = records, args.confidence, args.conflicts
-    curves = ood.extrapolation(*how)
-    tables = [
-        *ood.tier_tables(*how),
-        ood.hard_table(*how),
-        ood.twin_table(*how),
-        ood.extrapolation_table(curves),
-    ]
-    caption = "All splits of a run together; the training range is shaded."
-    filled = [table for table in tables if table]
-    require(
-        filled,
-        "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an"
-        " amount.",
-    )
-    show_tables(filled, ood.extrapolation_figures(curves), caption, records, args)
-
-
-def show_tables(
-    tables: Sequence[Table],
-    figures: dict[str, str],
-    caption: str,
-    records: Sequence[EpisodeRecord],
-    args: argparse.Namespace,
-) -> None:
-    """Print tables that have rows, and all notes, and write them, with figures, where a file is
-    named.
-    """
-    from rich.console import Console
-
-    texts: dict[Path, str] = {}
+    tables: list[Table | None]
+    if view == "stress":
+        curves = stress_curves(*how)
+        tables = [stress_table(curves)]
+        figures = stress_figures(curves)
+        caption = "Episodes that every place of the dial has."
+    elif view == "events":
+        curves = event_curves(*how)
+        tables = [
+            event_table(records, args.conflicts),
+            stress_table(curves, "Success over the length of events"),
+        ]
+        figures = stress_figures(curves, "control steps, frames or factor")
+        caption = "Episodes that every length has."
+    else:
+        curves = ood.extrapolation(*how)
+        tables = [
+            *ood.tier_tables(*how),
+            ood.hard_table(*how),
+            ood.twin_table(*how),
+            ood.extrapolation_table(curves),
+        ]
+        require(
+            any(tables),
+            "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an"
+            " amount.",
+        )
+        figures = ood.extrapolation_figures(curves)
+        caption = "All splits of a run together; the training range is shaded."
     notes: list[str] = []
     blocks: list[str] = []
     sections = [Section(name, figure, caption=caption) for name, figure in figures.items()]
-    for table in tables:
+    for table in filter(None, tables):
         notes += table.notes
         if table.rows:
             print_table(table, Console().width)
@@ -344,6 +318,7 @@ def show_tables(
     notes += missing_baselines(record.model for record in records)
     for note in notes:
         print(f"• {printable(note)}")
+    texts: dict[Path, str] = {}
     if args.markdown:
         lines = [f"- {escape_markdown(note)}\n" for note in notes]
         texts[args.markdown] = "\n".join([*blocks, "".join(lines)])

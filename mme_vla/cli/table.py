@@ -35,7 +35,9 @@ COMMANDS = {
         config="serve",
         check="mme_vla.serving.settings:ServeSettings.from_dict",
     ),
-    "harness": Command("mme_vla.cli.harness", "put a policy behind AI2's vla-evaluation-harness"),
+    "harness": Command(
+        "mme_vla.serving.harness", "put a policy behind AI2's vla-evaluation-harness"
+    ),
     "convert": Command(
         "mme_vla.cli.convert",
         "official HDF5 demonstrations to one LeRobot dataset",

@@ -198,6 +198,7 @@ def convert(
         draft.rename(target)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+    print(f"{target}: {formats()[to]}, weights in {dtype}.")
 
 
 def _policy(

@@ -167,13 +167,9 @@ def command_trees() -> tuple[Path, ...]:
     """Folders of YAML files that the running command reads: its own, then those of
     `--config-dir`.
     """
-    sources = []
-    for source in HydraConfig.get().runtime.config_sources:
-        if source.schema == "file" and source.provider != ExtensionTrees.PROVIDER:
-            sources.append(source)
-    # The command's own comes first, whatever the order in which Hydra searches.
-    sources.sort(key=lambda source: source.provider != "main")
-    return tuple(dict.fromkeys(Path(source.path).resolve() for source in sources))
+    paths = {source.provider: source.path for source in HydraConfig.get().runtime.config_sources}
+    trees = [Path(paths[name]).resolve() for name in ("main", "command-line") if name in paths]
+    return tuple(dict.fromkeys(trees))
 
 
 def join_plugins(

@@ -83,8 +83,8 @@ def name_composition(cfg: DictConfig, overrides: Iterable[str]) -> None:
     names = []
     for member in memory.get("members") or [memory]:
         names.append(member.get("name") if isinstance(member, Mapping) else member)
-    parts = ["+".join(filter(None, names)), (cfg.integration or {}).get("name")]
-    cfg.name = "_".join(filter(None, parts)) or "memoryless"
+    parts = ["+".join(map(str, filter(None, names))), (cfg.integration or {}).get("name")]
+    cfg.name = "_".join(map(str, filter(None, parts))) or "memoryless"
 
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")

@@ -236,7 +236,7 @@ def serve_websockets(
     return websocket_server(handler, host, port, process_request=refuse_pages, **options)
 
 
-def run_server(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Serve with the command-line options of the harness's model servers, but on this machine alone
     by default.
     """

@@ -391,8 +391,8 @@ def finish(
     with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
         draft.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     line.say(
-        f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (first and last twentieth"
-        " of the run)"
+        f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (means of the updates that"
+        " were logged first and last)"
     )
     line.say(f"checkpoint: {trainer.last_checkpoint}")
 
@@ -428,8 +428,8 @@ def _check_open_loop(trainer: Trainer, data: SplitData, line: ProgressLine) -> O
 
 
 def loss_change(lines: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """The mean training loss over the first and over the last twentieth of a run, and the last
-    validation loss.
+    """The mean training loss over the first and over the last twentieth of a run, in whole lines,
+    and the last validation loss.
 
     Args:
         lines: of `metrics.jsonl`; each holds the mean since the line before it.

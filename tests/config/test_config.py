@@ -363,6 +363,7 @@ def test_a_model_without_a_name_is_refused_by_the_key_that_lacks(tmp_path: Path)
         (["memory.budget=64"], "tokendrop_expert"),
         (["model=pi05", "memory=rmt", "integration=context"], "pi05"),
         (["memory=rmt", "name=mine"], "mine"),
+        (["memory.name=3", "integration.name=4"], "3_4"),
         (["experiment=real_robot", "data.sources=[a]", "integration=context"], "framesamp_modul"),
     ],
 )

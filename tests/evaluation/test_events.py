@@ -539,6 +539,9 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     # A training without some of the event's episodes counts at no place with these.
     (points,) = event_curves(made[:-2]).values()
     assert [(at, p.episodes) for at, p in points.items()] == [(0, 6), (64, 6)]
+    # As in the table: a mean over trainings, whatever their numbers of episodes.
+    assert event_table(made[:-2]).rows[0][5:7] == ["100.0 ± 0.0", "37.5 ± 17.7"]
+    assert [p.rate for p in points.values()] == [100.0, 37.5]
 
 
 @pytest.mark.slow

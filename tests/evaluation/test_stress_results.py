@@ -10,7 +10,7 @@ import pytest
 from helpers.rollout_fakes import records, save_records
 from mme_vla.cli.results import main
 from mme_vla.errors import UserError
-from mme_vla.evaluation.results.curves import stress_curves, stress_figures
+from mme_vla.evaluation.results.curves import stress_curves, stress_figures, stress_table
 
 
 def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
@@ -43,6 +43,15 @@ def test_twins_of_a_stress_split_have_a_curve_of_their_own() -> None:
         "test": {0: "1/2", 2: "0/2"},
         "twin": {0: "2/2", 2: "1/2"},
     }  # fmt: skip
+
+
+def test_a_curve_without_a_common_episode_is_named() -> None:
+    made = [*records("test", [1]), *records("stress:count=2", [1, 0])[1:]]
+    curves = stress_curves(made)
+    table = stress_table(curves)
+    assert not table.rows and not stress_figures(curves)
+    (note,) = table.notes
+    assert note.endswith("PickXtimes, count: no curve, since no episode is at all its places.")
 
 
 def test_two_configurations_of_one_name_have_a_curve_each() -> None:

@@ -26,12 +26,11 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus  # noqa: 
 from websockets.sync.client import connect  # noqa: E402
 from websockets.typing import Origin  # noqa: E402
 
-from mme_vla.cli.harness import main  # noqa: E402
 from mme_vla.embodiment import ROBOMME_JOINT  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 from mme_vla.policy.mme import MMEPolicy  # noqa: E402
 from mme_vla.serving import harness  # noqa: E402
-from mme_vla.serving.harness import MMEVLAModelServer  # noqa: E402
+from mme_vla.serving.harness import MMEVLAModelServer, main  # noqa: E402
 from mme_vla.serving.remote.policy import RemotePolicy  # noqa: E402
 from mme_vla.serving.remote.settings import ServerChoice  # noqa: E402
 from mme_vla.serving.settings import Limits  # noqa: E402

@@ -190,6 +190,7 @@ def test_a_robot_comes_from_a_folder_of_yaml_files(
         main(words)
     assert "--config-dir DIR" in capsys.readouterr().err
     main([*words, "--config-dir", str(tmp_path)])
+    assert "arm: save_pretrained() of this library, weights in float32." in capsys.readouterr().out
     assert MMEPolicy.from_pretrained(tmp_path / "arm").embodiment.camera_names == ("head",)
 
 

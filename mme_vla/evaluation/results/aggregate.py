@@ -257,8 +257,11 @@ def aggregate(
     """
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))
-    protocol = replace(protocol, task_suites={**suites_of(records), **protocol.task_suites})
-    protocol = replace(protocol, groupings={**groupings_of(records), **protocol.groupings})
+    protocol = replace(
+        protocol,
+        task_suites={**suites_of(records), **protocol.task_suites},
+        groupings={**groupings_of(records), **protocol.groupings},
+    )
     merged = merge(records, conflicts)
     splits = sorted({record.split for record in merged})
     require(

@@ -26,8 +26,8 @@ from mme_vla.utils.style import COLOURS, LINE, figure, svg
 
 @dataclass(frozen=True)
 class Share:
-    """Successes among episodes. rate: a mean over tasks; interval: of it, over distinct episodes;
-    both in percent.
+    """Successes among episodes. rate: a mean over tasks, then over runs; interval: of it, over
+    distinct episodes; both in percent.
     """
 
     won: int
@@ -42,7 +42,8 @@ class Share:
 def count_successes(table: pd.DataFrame, confidence: float) -> Share:
     """Count the successes of a part of `record_table` that has one row at least."""
     success = table["success"]
-    rate = float(success.groupby(table["task"]).mean().mean())
+    of_runs = success.groupby([table["run"], table["task"]], sort=False).mean()
+    rate = float(of_runs.groupby(level="run", sort=False).mean().mean())
     splits = np.array([record.split for record in table["record"]])
     # Trainings share the scene of an episode.
     distinct = success.groupby([table["task"], splits, table["episode"]]).mean()
@@ -52,7 +53,9 @@ def count_successes(table: pd.DataFrame, confidence: float) -> Share:
 
 
 Curves = dict[tuple[str, str, str], dict[float, Share]]
-"""(run, task, dial) → how far it is turned, ascending → success there."""
+"""(run, task, dial) → how far it is turned, ascending → success there; no point where no episode is
+at every place of the dial.
+"""
 
 
 class Place(NamedTuple):
@@ -142,9 +145,9 @@ def curves_of(
         common = set.intersection(*map(set, sides))
         if same_scenes:
             common = set(pair(sides).keys)
+        curves[run, task, dial] = {}
         if not common:
             continue
-        curves[run, task, dial] = {}
         for turned, side in sorted(zip(points, sides, strict=True), key=itemgetter(0)):
             counted: list[EpisodeRecord] = []
             for key in common:
@@ -155,13 +158,17 @@ def curves_of(
 
 
 def stress_table(curves: Curves, title: str = "Success over the dials") -> Table:
-    """Every point, a row each."""
+    """Every point, a row each, and a note on every curve without a point."""
     rows = []
+    notes = []
     for (run, task, dial), points in sorted(curves.items()):
+        if not points:
+            notes.append(f"{run}, {task}, {dial}: no curve, since no episode is at all its places.")
         for turned, share in points.items():
             cells = [f"{turned:g}", str(share.episodes), f"{share.rate:.1f}", span(share.interval)]
             rows.append([run, task, dial, *cells])
-    return Table(title, ["run", "task", "dial", "at", "episodes", "success (%)", "interval"], rows)
+    columns = ["run", "task", "dial", "at", "episodes", "success (%)", "interval"]
+    return Table(title, columns, rows, notes=notes)
 
 
 def stress_figures(
@@ -174,11 +181,12 @@ def stress_figures(
     unit: of the dial; empty where the dial's name says it.
     training: task → the range of its training episodes, which is shaded.
     """
+    drawn = {curve: points for curve, points in curves.items() if points}
     groups: dict[tuple[str, str], dict[str, Mapping[float, Share]]] = {}
-    for _, task, dial in sorted(curves):
+    for _, task, dial in sorted(drawn):
         groups[task, dial] = {}
     # Runs keep the order of the records, and with it their colours.
-    for (run, task, dial), points in curves.items():
+    for (run, task, dial), points in drawn.items():
         groups[task, dial][run] = points
     figures = {}
     for (task, dial), runs in groups.items():

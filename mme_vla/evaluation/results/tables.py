@@ -3,10 +3,13 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
 
 from mme_vla.errors import counted, printable
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord
@@ -16,9 +19,6 @@ from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import GROUPING, PAPER_SEEDS, scopes
 from mme_vla.evaluation.results.statistics import Interval
 from mme_vla.utils.pages import escape_markdown
-
-if TYPE_CHECKING:
-    from rich.table import Table as RichTable
 
 
 @dataclass
@@ -327,10 +327,6 @@ def print_table(table: Table, width: int) -> None:
     """Print for people, `width` characters wide: columns that do not fit follow below, with the
     first one again. No number is ever cut, and no escape sequence of a name is obeyed.
     """
-    from rich.cells import cell_len
-    from rich.console import Console
-    from rich.text import Text
-
     # What each column needs: its cells, and the words of its heading
     columns = list(zip(table.columns, *table.rows, strict=True))
     needs = []
@@ -361,11 +357,8 @@ def print_table(table: Table, width: int) -> None:
         console.print(_to_rich(table, [0, *block], [first, *widths]))
 
 
-def _to_rich(table: Table, columns: Sequence[int], widths: Sequence[int]) -> "RichTable":
+def _to_rich(table: Table, columns: Sequence[int], widths: Sequence[int]) -> RichTable:
     """Some of the columns, of these widths."""
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
     rendered = RichTable()
     for column, width in zip(columns, widths, strict=True):
         rendered.add_column(
