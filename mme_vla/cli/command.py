@@ -117,17 +117,12 @@ def _checked_arguments(
     """Hydra's options and overrides on a command line, in any order."""
 
     def refuse(message: str) -> NoReturn:
-        """An option with too few words, or the beginning of several."""
-        names = _names(config_name, tree, [])
-        for word in words:
-            option = word.partition("=")[0]
-            if option.startswith("--") and option not in names.options:
-                raise unknown_option(word, words, names)
-        # such as "argument --config-dir/-cd: expected one argument"
+        """Such as "argument --config-dir/-cd: expected one argument"."""
         raise UserError(f"{message.capitalize()}. --help lists the options.")
 
     parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]
+    parser.allow_abbrev = False  # `--config` is told what it may mean, as any unknown option
     args, unknown = parser.parse_known_intermixed_args(words)
     if unknown:
         raise unknown_option(unknown[0], words, _names(config_name, tree, []))
