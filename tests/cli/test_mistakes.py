@@ -31,6 +31,7 @@ def reply(
         ("train --model tokendrop_expert", "write model=tokendrop_expert."),
         ("train --config configs", "Did you mean '--config-dir'?"),
         ("train --config-dir", "--config-dir/-cd: expected one argument"),
+        ("train --multi model=pi05,rmt_expert", "Did you mean '--multirun'?"),
         ("train model", "Did you mean model=…? `--help model` lists its names."),
         ("train model pi05", "write model=pi05."),
         ("train pi05", "Did you mean model=pi05 or"),
