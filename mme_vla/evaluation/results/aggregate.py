@@ -166,14 +166,6 @@ class Method:
         """The runs of each training; all in one group where records do not name their training."""
         return by_training(self.runs)
 
-    @property
-    def checkpoints(self) -> dict[int | str, list[Run]]:
-        """The runs of each checkpoint, in their order."""
-        groups: dict[int | str, list[Run]] = {}
-        for run in self.runs:
-            groups.setdefault(run.key.checkpoint, []).append(run)
-        return groups
-
     @cached_property
     def success(self) -> pd.DataFrame:
         """Success of every episode, a column for each of `runs` by its number: 1, 0, or NaN where

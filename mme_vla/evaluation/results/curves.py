@@ -181,12 +181,12 @@ def stress_figures(
     unit: of the dial; empty where the dial's name says it.
     training: task → the range of its training episodes, which is shaded.
     """
-    drawn = {curve: points for curve, points in curves.items() if points}
+    plotted = {curve: points for curve, points in curves.items() if points}
     groups: dict[tuple[str, str], dict[str, Mapping[float, Share]]] = {}
-    for _, task, dial in sorted(drawn):
+    for _, task, dial in sorted(plotted):
         groups[task, dial] = {}
     # Runs keep the order of the records, and with it their colours.
-    for (run, task, dial), points in drawn.items():
+    for (run, task, dial), points in plotted.items():
         groups[task, dial][run] = points
     figures = {}
     for (task, dial), runs in groups.items():

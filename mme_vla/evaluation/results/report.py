@@ -14,7 +14,7 @@ from mme_vla.config.naming import DEFAULT_BUDGET, flat
 from mme_vla.errors import counted
 from mme_vla.evaluation.records import checkpoint_number
 from mme_vla.evaluation.results import plots
-from mme_vla.evaluation.results.aggregate import Figure, Method, Results
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
@@ -308,7 +308,10 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
     """The section `Training details` of a submission, in Markdown."""
     policies = []
     for method in methods:
-        for checkpoint, members in method.checkpoints.items():
+        checkpoints: dict[int | str, list[Run]] = {}
+        for run in method.runs:
+            checkpoints.setdefault(run.key.checkpoint, []).append(run)
+        for checkpoint, members in checkpoints.items():
             # What the notes of a run of this policy say of it
             facts = None
             for content in runs:

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from mme_vla.errors import counted, printable
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run, by_training
 from mme_vla.evaluation.results.baselines import is_standing
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import GROUPING, PAPER_SEEDS, scopes
@@ -279,9 +279,12 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
 
     Cells of a run that lacks episodes of a task say how many there are, and have no average.
     """
+    checkpoints: dict[int | str, list[Run]] = {}
+    for run in method.runs:
+        checkpoints.setdefault(run.key.checkpoint, []).append(run)
     order = {seed: i for i, seed in enumerate(PAPER_SEEDS)}
     tables = []
-    for checkpoint, runs in method.checkpoints.items():
+    for checkpoint, runs in checkpoints.items():
         runs.sort(key=lambda run: (order.get(run.key.model_seed, len(order)), run.key.model_seed))
         several = len(by_training(runs)) > 1
         columns = ["Task"]
