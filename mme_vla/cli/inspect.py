@@ -57,6 +57,7 @@ from mme_vla.training.open_loop import (
     plot_open_loop,
 )
 from mme_vla.training.settings import DataSettings
+from mme_vla.types import FrameBatch
 
 
 @dataclass(frozen=True)
@@ -434,7 +435,8 @@ def draw_memory(
     stored = memory.storage.stored_frames(len(frames))
     if history is None:
         filled = OnlineHistory(memory.storage, memory.make_scorer(), start)
-        filled.append(frames, torch.zeros(len(stored), memory.storage.grid**2, 1))
+        patches = memory.storage.grid**2
+        filled.take(FrameBatch.of(frames), lambda images: torch.zeros(len(images), patches, 1))
         motion = normalised_states(source.states(episode, 0, step + 1))
         filled.motion = motion.__getitem__
         filled.state_width = motion.shape[1]
