@@ -99,6 +99,7 @@ class _Moments:
         self._policy, self._recording, self._settings = policy, recording, settings
         self._seed = episode_seed(settings.seed, recording.task, recording.episode)
         self._steps = recording.decisions(policy.embodiment.action.execute, settings.moments)
+        self._decisions = recording.decisions(policy.embodiment.action.execute, None)
         self._subgoal_kind = subgoal_kind(policy)
         self._boundaries = recording.boundaries()
         sessions = others(lend, recording, recording.goal)
@@ -120,19 +121,24 @@ class _Moments:
         for arms in self._by_feed.values():
             episode = arms[0].start_episode(recording.goal, self._seed)
             episode.recording = recording
-            required = self._required_frames(arms)
+            # Where no frames are chosen from, a memory is written where chunks are chosen: at each
+            # decision, as in a running episode.
+            steps = self._steps if arms[0].channel.chooses else self._decisions
+            required = self._required_frames(arms, steps)
             n_observed = 0
-            for step in self._steps:
-                recording.show(episode, n_observed, step + 1, required)
-                n_observed = step + 1
-                episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
+            for step in self._decisions:
                 if self._subgoal_kind is not None:
                     episode.subgoal = recording.subgoal(step, self._subgoal_kind)
                 episode.subgoals.append(episode.subgoal)
-                for probed in arms:
-                    result += self._probe(probed, episode, step)
+                if step not in steps:
+                    continue
+                recording.show(episode, n_observed, step + 1, required)
+                n_observed = step + 1
+                episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
+                if step in self._steps:
+                    for probed in arms:
+                        result += self._probe(probed, episode, step)
                 episode.inner.subgoal = episode.subgoal
-                # banks are written where chunks are chosen
                 self._policy.act([episode.inner], self._settings.flow_steps)
         return result
 
@@ -206,11 +212,13 @@ class _Moments:
         """Sub-tasks of the execution that began before this step's."""
         return sum(self._recording.exec_start < frame <= step for frame in self._boundaries)
 
-    def _required_frames(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
-        """Frames that any of these arms reads; None for all."""
+    def _required_frames(
+        self, arms: Sequence[ProbedPolicy], steps: Sequence[int]
+    ) -> np.ndarray | None:
+        """Frames that any of these arms reads at these steps; None for all."""
         required: np.ndarray = np.zeros(0, np.int64)
         for probed in arms:
-            frames = probed.frames_read(np.array(self._steps), self._recording.exec_start)
+            frames = probed.frames_read(np.array(steps), self._recording.exec_start)
             if frames is None:
                 return None
             required = np.union1d(required, frames)

@@ -162,13 +162,15 @@ class ProbedEpisode(Episode):
             if self._decisions:
                 self.inner.close()
                 self.inner = self.policy.inner.start_episode("", self.seed + self._decisions)
+                _show_all(self.policy.sessions, self.inner, self.policy.inner)
             self.inner.options = self.options
         else:
             self._collected = None
         self._decisions += 1
-        if arm.lag:
+        if arm.lag and not arm.renews:
             for name, view in collected.views.items():
-                self._before[name] = np.concatenate([before[name], view])[-arm.lag :]
+                executed = view[~collected.demo]
+                self._before[name] = np.concatenate([before[name], executed])[-arm.lag :]
         shown.observe_in(self.inner)
 
     @property

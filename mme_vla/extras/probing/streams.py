@@ -29,8 +29,8 @@ class Shown:
     led: bool [t], False where none did.
     motions: [n, w], actions that are motions of any length, in place of these.
     ends: int64 [n], the number of the last frame that came with each.
-    before: by camera the images right before these, as many as the arm's `lag`, fewer at the
-        beginning.
+    before: by camera the images of the execution right before these, as many as the arm's `lag`,
+        fewer at the beginning.
     start: the state [s] at the first execution frame, once it was observed.
     """
 
@@ -111,7 +111,15 @@ class Forget(Perturbation):
     needs: ClassVar = frozenset({"stream"})
 
     def show(self, frames: Shown, moment: Moment) -> Shown:
-        return frames.take(np.array([len(frames) - 1]))
+        executed = np.flatnonzero(~frames.demo)
+        return replace(
+            frames.take(executed[-1:]),
+            # As after a reset, no action led to it.
+            led=np.zeros(1, bool),
+            motions=frames.motions[:0],
+            ends=frames.ends[:0],
+            before={name: view[executed[:-1]] for name, view in frames.views.items()},
+        )
 
 
 @PERTURBATIONS.register("replay")
@@ -213,11 +221,9 @@ class Late(Perturbation):
         views = {}
         for name, view in frames.views.items():
             known = np.concatenate([frames.before[name], view])
-            first = len(known) - len(view)
+            now = np.arange(len(frames.before[name]), len(known))
             # Not before the first execution frame: the video is over by then.
-            start = first + moment.exec_start - int(frames.numbers[0])
-            now = np.arange(first, len(known))
-            shown = np.maximum(now - self.frames, max(start, 0))
+            shown = np.maximum(now - self.frames, frames.demo.sum())
             shown = np.where(frames.demo, now, shown)
             views[name] = known[shown]
         return replace(frames, views=views)

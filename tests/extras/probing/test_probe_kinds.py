@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.probe_fakes import made_up, probed
+from helpers.probe_fakes import MadeUpSource, made_up, probed
 from helpers.rollout_fakes import quick_policy
 from mme_vla import build_policy
 from mme_vla.errors import UserError
@@ -15,7 +15,7 @@ from mme_vla.extras.methods.sam2act.sam2 import BankState
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.lines import MomentLine
-from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
+from mme_vla.extras.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy
 from mme_vla.memory.base import all_patches
 from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.processing.normalise import NormStats
@@ -266,6 +266,43 @@ def test_a_subgoal_of_another_episode_reaches_the_prompt() -> None:
     assert episode.inner.subgoal[-1] in "12" and episode.inner.subgoal.startswith(
         "pick it up for the first time"
     )
+
+
+def test_on_recordings_a_late_subgoal_is_that_of_chunks_ago_however_few_are_probed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def subgoals(source: MadeUpSource, episode: int, step: int) -> dict[str, str]:
+        return {"simple_subgoal": f"the one of step {step}"}
+
+    monkeypatch.setattr(MadeUpSource, "subgoals", subgoals)
+    read = []
+    ask = ProbedPolicy.ask
+
+    def note(probe: ProbedPolicy, episode: ProbedEpisode, *arguments: Any, **options: Any) -> Any:
+        read.append((probe.arm.name, episode.inner.subgoal))
+        return ask(probe, episode, *arguments, **options)
+
+    monkeypatch.setattr(ProbedPolicy, "ask", note)
+    probed(quick_policy("simplesg", 8).eval(), ["subgoal_delay:1"], tmp_path, moments=2)
+    # Decisions are at 20, 36 and 52.
+    assert read == [
+        ("unprobed", "the one of step 20"),
+        ("subgoal_delay:1", "the one of step 20"),
+        ("unprobed", "the one of step 52"),
+        ("subgoal_delay:1", "the one of step 36"),
+    ]
+
+
+def test_a_bank_holds_every_decision_however_few_are_probed(tmp_path: Path) -> None:
+    entries = []
+    for moments in (None, 2):
+        folder = tmp_path / str(moments)
+        folder.mkdir()
+        lines = probed(memoryvla(), ["drop:all"], folder, draws=2, moments=moments, scan=False)
+        entries.append([(line.step, line.entries) for line in lines])
+    every, few = entries
+    assert [step for step, *_ in few] == [20, 52]
+    assert few == [every[0], every[-1]]
 
 
 @pytest.mark.parametrize("kind", KINDS)

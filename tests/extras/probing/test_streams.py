@@ -73,6 +73,7 @@ def sent(stubs: Any, folder: Path, arm: str) -> tuple[list[list[int]], list[dict
 
 
 FIRST, SECOND = list(range(VIDEO + 1)), list(range(VIDEO + 1, VIDEO + 17))
+OTHER = [-1] * 60  # an episode of the donors
 
 
 @pytest.mark.parametrize(
@@ -88,6 +89,10 @@ FIRST, SECOND = list(range(VIDEO + 1)), list(range(VIDEO + 1, VIDEO + 17))
         ("pause:3", [[*FIRST, 5, 5, 5], SECOND]),
         ("swap_frames", [[-1] * 5 + [5], [-1] * 15 + [21]]),
         ("nodemo+linger:1", [[5, 5], [*SECOND, 21]]),
+        ("forget+late:3", [[5], [18]]),
+        ("late:3+forget", [[5], [18]]),
+        ("distract:1+replay", [[*OTHER, *FIRST], [*OTHER, *FIRST, *SECOND]]),
+        ("distract:1+forget", [[*OTHER, 5], [*OTHER, 21]]),
     ],
 )
 def test_a_server_is_sent_what_the_arm_says(
@@ -143,7 +148,7 @@ def test_a_policy_that_is_loaded_here_takes_the_same_arms(
     ("arm", "expected"),
     [
         ("replay", [(5, None), (8, [1.0]), (10, [1.0, 2.0])]),
-        ("forget", [(1, None), (1, [1.0]), (1, [2.0])]),
+        ("forget", [(1, None), (1, None), (1, None)]),
         ("linger:2", [(7, None), (5, [1.0]), (4, [2.0])]),
     ],
 )
@@ -173,6 +178,28 @@ def test_motions_of_any_length_come_with_the_frames_at_their_end(
         episode.observe(images, np.zeros((count, 8), np.float32), demo, actions)
         episode.show_collected()
     assert observed == expected
+
+
+def test_late_images_are_of_the_execution_where_frames_are_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    policy = quick_policy("framesamp_modul", 8).eval()
+    shown: list[list[int]] = []
+
+    def note(episode: Episode, frames: Any, *_: Any) -> None:
+        shown.append(frames["front"][:, 0, 0, 0].tolist())
+
+    monkeypatch.setattr(Episode, "observe", note)
+    arm = read_arm("drop_frames:0.5+late:20")
+    episode = ProbedPolicy(policy, arm).start_episode("pick up the cube")
+    for start, stop in ((0, 11), (11, 19), (19, 27)):
+        numbers = np.arange(start, stop, dtype=np.uint8)
+        view = np.broadcast_to(numbers[:, None, None, None], (len(numbers), 64, 64, 3))
+        states = np.zeros((len(numbers), 8), np.float32)
+        episode.observe({"front": view, "wrist": view}, states, numbers < 10)
+        episode.show_collected()
+    assert shown[0] == [0, 2, 4, 6, 8, 10]
+    assert {*shown[1], *shown[2]} == {10}
 
 
 def test_what_acts_in_episodes_is_not_probed_at_recorded_steps(stubs: Any, tmp_path: Path) -> None:
