@@ -65,7 +65,7 @@ def run_configured(
     def job(cfg: DictConfig) -> object:
         with print_user_errors():
             # here too: Hydra would print a traceback before it gets further
-            if missing := sorted(OmegaConf.missing_keys(cfg)):
+            if missing := sorted(OmegaConf.missing_keys(resolved(cfg))):
                 needed = " ".join(f"{key}=…" for key in missing)
                 raise UserError(f"A value is needed for {', '.join(missing)}: add {needed}")
             hydra_cfg = HydraConfig.get()

@@ -114,6 +114,18 @@ def test_a_file_that_is_not_searched_is_named(
     assert "A file of your own, DIR/model/other.yaml, is found with --config-dir DIR." in elsewhere
 
 
+def test_a_robots_file_that_lacks_what_others_refer_to_is_told_which_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "configs" / "embodiment"
+    folder.mkdir(parents=True)
+    (folder / "arm.yaml").write_text("{name: arm, cameras: {top: {}}, action: {width: 3}}")
+    words = ["train", "--config-dir", str(folder.parent), "embodiment=arm", "plugins=[json]"]
+    text = reply(words, monkeypatch, capsys)
+    assert "Interpolation key 'embodiment.action.horizon' not found" in text
+    assert "Add that key to your YAML file" in text
+
+
 def test_a_setting_in_a_command_with_options_becomes_one(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

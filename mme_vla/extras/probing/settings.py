@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, read_section
+from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, Range, read_section
 from mme_vla.data.lerobot_files import resolve_root
 from mme_vla.data.sources import listed_sources
 from mme_vla.errors import ERROR, UserError, brief, check_choice, require, text_of
@@ -28,14 +28,15 @@ IN_CLOSED_LOOP = (
 class OfflineSettings:
     """Settings of a probe on recorded episodes.
 
-    draws: chunks sampled at each step, of the same noise in every arm.
+    draws: chunks sampled at each step, of the same noise in every arm; the policy's own spread is
+        between two of them.
     moments: most steps of an episode.
     scan: whether each entry is left out by itself.
     flow_steps: of the sampler; None for the policy's own.
     """
 
     seed: NonNegativeInt = 42
-    draws: PositiveInt = 8
+    draws: Annotated[int, Range(least=2)] = 8
     moments: PositiveInt | None = 8
     scan: bool = True
     flow_steps: int | None = None

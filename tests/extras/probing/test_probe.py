@@ -171,6 +171,11 @@ def test_arms_compose_in_their_order(tmp_path: Path) -> None:
     assert any(max(line.touched) > line.step - 20 for line in moments if line.arm == "drop:all")
 
 
+def test_one_chunk_a_decision_is_too_few_since_its_spread_is_not_known(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="draws=1 must be a whole number, 2 or more"):
+        probe("nano", "sample", output=tmp_path, draws=1)
+
+
 @pytest.mark.parametrize(
     "name", ["framesamp_context", "tokendrop_modul", "ttt_expert", "rmt_modul"]
 )
