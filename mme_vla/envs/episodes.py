@@ -58,7 +58,9 @@ def _are_all(episodes: Any) -> bool:
     return episodes is None or (isinstance(episodes, str) and episodes == ALL)
 
 
-def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[int]:
+def choose_numbers(
+    episodes: Any, count: int, what: str = "the split", key: str = "episodes"
+) -> list[int]:
     """Numbers of episodes.
 
     Args:
@@ -66,23 +68,24 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
             numbers, or text of numbers and ranges (`0-9`, `0-3,7`). `[3]` is episode number three
             alone, `3` the first three.
         count: of episodes in `what`, which messages name.
+        key: of the value, for messages.
     """
     if _are_all(episodes):
         return list(range(count))
     if isinstance(episodes, int) and not isinstance(episodes, bool):
-        problem = f"episodes={episodes} means the first {episodes}; {what} has {count}."
+        problem = f"{key}={episodes} means the first {episodes}; {what} has {count}."
         if 0 <= episodes < count:
-            problem += f" For number {episodes} alone write episodes=[{episodes}]."
+            problem += f" For number {episodes} alone write {key}=[{episodes}]."
         require(1 <= episodes <= count, problem)
         return list(range(episodes))
-    ranges = spans(episodes, "episodes", GRAMMAR)
+    ranges = spans(episodes, key, GRAMMAR)
     last = max((span.stop for span in ranges), default=0) - 1
     require(
         last < count, f"There is no episode {last} in {what}, which has {count}: 0 to {count - 1}."
     )
     numbers = [number for span in ranges for number in span]
     once = numbers and len(set(numbers)) == len(numbers)
-    require(once, f"episodes={episodes} must name each episode once, and at least one.")
+    require(once, f"{key}={episodes} must name each episode once, and at least one.")
     return numbers
 
 

@@ -62,3 +62,9 @@ def test_commands_that_need_tasks_ask_for_them() -> None:
 def test_what_names_no_episodes_is_refused_at_once(episodes: object) -> None:
     with pytest.raises(UserError, match="episode"):
         choose_numbers(episodes, 50)
+
+
+@pytest.mark.parametrize("episodes", [99, "5-2", [3, 3]])
+def test_a_wrong_number_is_reported_under_the_key_that_was_written(episodes: object) -> None:
+    with pytest.raises(UserError, match=r"^recorded="):
+        choose_numbers(episodes, 12, "the data", "recorded")

@@ -22,7 +22,6 @@ from mme_vla.memory.perturbation import (
     overrides,
 )
 from mme_vla.policy.base import Policy
-from mme_vla.policy.sections import PolicySections
 
 DEFAULT_ARMS = (
     "drop:all",
@@ -227,8 +226,7 @@ def choose_arms(
         if why is None:
             arms.append(arm)
         elif specs is not None:
-            name = PolicySections.of(policy.config).name or "this policy"
-            raise UserError(f"with={arm.name} needs {why}; {name} has none here.")
+            raise UserError(f"with={arm.name} needs {why}.")
         elif why != NEEDS["subgoal"]:
             names_of_reasons.setdefault(why, []).append(arm.name)
     left_out = []

@@ -113,6 +113,16 @@ class ProbeChoice:
         )
         needs_data = self.on_recordings and not self.card
         require(not needs_data or self.recordings is not None, NO_DATA)
+        for key, value in {"with": self.arms, "event": self.event}.items():
+            require(
+                not (self.card and value),
+                f"card=true measures the histories of a report card: leave out {key}=….",
+            )
+        require(
+            self.card or not self.references,
+            "references=… stand beside the figures of a report card: add card=true, or leave it"
+            " out.",
+        )
         require(self.online or not event_arms(self.event), IN_CLOSED_LOOP)
         check_all(self._check_arms, self._check_recordings)
 

@@ -98,19 +98,33 @@ def test_tasks_weigh_the_same_and_left_out_pairs_are_named() -> None:
     ]  # fmt: skip
 
 
+CONFIG: dict[str, Any] = {
+    "compare": None, "card": False, "twins": False, "offline": True, "online": False,
+    "recordings": None, "event": None, "server": None, "references": {}, "with": None,
+    "trust_plugins": False,
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("key", "value"), [("with", ["shuffle"]), ("recordings", "data"), ("online", True)]
 )
 def test_what_has_no_effect_on_twins_is_refused(key: str, value: Any) -> None:
-    config: dict[str, Any] = {
-        "compare": None, "card": False, "twins": True, "offline": True, "online": False,
-        "recordings": None, "event": None, "server": None, "references": {}, "with": None,
-        "trust_plugins": False,
-    }  # fmt: skip
+    config = {**CONFIG, "twins": True}
     assert not ProbeChoice.from_config(config).on_recordings
     ProbeChoice.from_config(config).check()
     with pytest.raises(UserError, match=f"leave out {key}="):
         ProbeChoice.from_config({**config, key: value}).check()
+
+
+def test_what_has_no_effect_on_a_card_is_refused_and_references_without_one() -> None:
+    card = {**CONFIG, "card": True, "references": {"memoryless": "outputs/present"}}
+    ProbeChoice.from_config(card).check()
+    for key, value in {"with": ["shuffle"], "event": "pause:4"}.items():
+        with pytest.raises(UserError, match=f"a report card: leave out {key}="):
+            ProbeChoice.from_config({**card, key: value}).check()
+    online = {**card, "card": False, "offline": False, "online": True}
+    with pytest.raises(UserError, match=r"references=… stand beside .* add card=true"):
+        ProbeChoice.from_config(online).check()
 
 
 # An environment of one's own ----------------------------------------------------------------------

@@ -74,7 +74,7 @@ def probe(cfg: DictConfig) -> None:
         recordings = all_recordings(sources, action_offset_of(policy))
     probed = []
     if choice.on_recordings:
-        numbers = choose_numbers(values["recorded"], len(recordings), "the data")
+        numbers = choose_numbers(values["recorded"], len(recordings), "the data", "recorded")
         probed = [recordings[i] for i in numbers]
     subgoals = None
     if jobs and not choice.twins:
