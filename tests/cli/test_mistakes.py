@@ -114,7 +114,7 @@ def test_a_file_that_is_not_searched_is_named(
     assert "A file of your own, DIR/model/other.yaml, is found with --config-dir DIR." in elsewhere
 
 
-def test_a_robots_file_that_lacks_what_others_refer_to_is_told_which_key(
+def test_a_robots_file_that_lacks_what_others_refer_to_names_the_missing_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "configs" / "embodiment"

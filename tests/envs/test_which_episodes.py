@@ -65,6 +65,6 @@ def test_what_names_no_episodes_is_refused_at_once(episodes: object) -> None:
 
 
 @pytest.mark.parametrize("episodes", [99, "5-2", [3, 3]])
-def test_a_wrong_number_is_reported_under_the_key_that_was_written(episodes: object) -> None:
+def test_a_wrong_number_is_reported_under_its_key(episodes: object) -> None:
     with pytest.raises(UserError, match=r"^recorded="):
         choose_numbers(episodes, 12, "the data", "recorded")

@@ -184,10 +184,10 @@ def test_late_images_are_of_the_execution_where_frames_are_left_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     policy = quick_policy("framesamp_modul", 8).eval()
-    shown: list[list[int]] = []
+    pixels: list[list[int]] = []
 
     def note(episode: Episode, frames: Any, *_: Any) -> None:
-        shown.append(frames["front"][:, 0, 0, 0].tolist())
+        pixels.append(frames["front"][:, 0, 0, 0].tolist())
 
     monkeypatch.setattr(Episode, "observe", note)
     arm = read_arm("drop_frames:0.5+late:20")
@@ -198,8 +198,8 @@ def test_late_images_are_of_the_execution_where_frames_are_left_out(
         states = np.zeros((len(numbers), 8), np.float32)
         episode.observe({"front": view, "wrist": view}, states, numbers < 10)
         episode.show_collected()
-    assert shown[0] == [0, 2, 4, 6, 8, 10]
-    assert {*shown[1], *shown[2]} == {10}
+    assert pixels[0] == [0, 2, 4, 6, 8, 10]
+    assert {*pixels[1], *pixels[2]} == {10}
 
 
 def test_what_acts_in_episodes_is_not_probed_at_recorded_steps(stubs: Any, tmp_path: Path) -> None:
