@@ -153,9 +153,11 @@ def _checked_arguments(
         output = OmegaConf.to_container(cfg).get("output")  # type: ignore[union-attr]
         if names_output and output is not None:
             check_output(str(output))
-        if check and not args.cfg and not OmegaConf.missing_keys(cfg):
-            plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
-            pkgutil.resolve_name(check)(resolved(cfg))
+        if check and not args.cfg:
+            values = resolved(cfg)
+            if not OmegaConf.missing_keys(values):
+                plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
+                pkgutil.resolve_name(check)(values)
     return args
 
 
