@@ -465,7 +465,9 @@ def _parser() -> argparse.ArgumentParser:
         help="these alone, such as StopCube,BinFill, or all 16 (default: those with records)",
     )
     parser.add_argument("--episodes", help=f"of each task: {GRAMMAR} (default: those with records)")
-    parser.add_argument("--split", help="test, val or train, where there are records of several")
+    parser.add_argument(
+        "--split", help="one of them, such as test, where there are records of several"
+    )
     parser.add_argument(
         "--errors",
         default="failure",

@@ -1,5 +1,4 @@
-"""`mme-vla sample FULL_FOLDER THINNED_FOLDER`: make the dataset that the package ships,
-`mme_vla/assets/sample`.
+"""`mme-vla sample FULL_FOLDER THINNED_FOLDER`: make the shipped dataset, `mme_vla/assets/sample`.
 
 Four real demonstrations, one of them with an image for every step, as a LeRobot v3.0 dataset of
 under 6 MB. It exists so that the first command of the README needs nothing else; users need not run

@@ -41,7 +41,7 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         split: whose episodes are sampled; `episode` fixes one of them.
         action_space: `joint_angle`, `ee_pose` or `waypoint`.
         reward: `sparse`, `subtask` or `none`.
-        images: whether frames are rendered; without, a step is about 80 times faster.
+        images: whether frames are rendered; without, a step is some 30 times faster.
         max_steps: control steps until an episode is truncated, several of which an action by poses
             may take; None: as many as the split allows. `make_env` and `evaluate` count as the
             benchmark does, one step more.

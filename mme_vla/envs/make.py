@@ -59,8 +59,8 @@ def make_env(
             allows.
         row: builds the scene of these values (`env.scene_values()`) instead of an episode of the
             split.
-        render: whether observations hold images; without it no Vulkan is needed and steps are about
-            80 times faster.
+        render: whether observations hold images; without it no Vulkan is needed and steps are some
+            30 times faster.
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds.
             `subtask`: an equal share for each sub-task of the execution as it is done, 1 in all. Or
             your own, registered in `REWARDS`.

@@ -47,14 +47,13 @@ def model_card(policy: nn.Module, config: Mapping[str, Any], self_check: bool = 
     network = backbone.get("name", "pi05")
     if "depth" in backbone:
         network += f", {backbone['depth']} layers"
+    robot = embodiment_of(config)
     rows = {
         "memory": _part(sections.memory),
         "integration": _part(sections.integration),
         "backbone": network,
-        "robot": embodiment_of(config).name,
-        "action chunk": (
-            f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers"
-        ),
+        "robot": robot.name,
+        "action chunk": f"{robot.action.horizon} steps of {robot.action.width} numbers",
         "parameters": f"{sum(p.numel() for p in policy.parameters()) / 1e6:.1f} M",
     }
     if sections.adapters:

@@ -11,6 +11,7 @@ import pytest
 from config_pages import keys
 
 from helpers import REPOSITORY
+from mme_vla import __main__ as entry
 from mme_vla import cli
 from mme_vla.cli.help import configured_commands, defaults, help_page
 from mme_vla.config.composition import compose
@@ -52,6 +53,17 @@ def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> 
         help_page("train", ["memori"], trees)
     with pytest.raises(UserError, match=r"Unknown memory 'mime'\. Did you mean 'mine'"):
         help_page("train", ["memory=mime"], trees)
+
+
+@pytest.mark.parametrize("command", ["docs", "results", "sample", "train-tokenizer", "weights"])
+def test_help_describes_a_command_in_whole_sentences(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["mme-vla", command, "--help"])
+    with pytest.raises(SystemExit):
+        entry.main()
+    before_arguments = re.split(r"\n(?:positional arguments|options):", capsys.readouterr().out)[0]
+    assert before_arguments.rstrip().endswith(".")
 
 
 @pytest.mark.slow

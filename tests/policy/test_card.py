@@ -30,6 +30,13 @@ def test_every_name_stays_a_name(policy: MMEPolicy, name: str) -> None:
     assert data.license is None and data.eval_results is None
 
 
+def test_a_card_states_the_numbers_of_an_action_and_not_of_the_network(policy: MMEPolicy) -> None:
+    space = policy.embodiment.action
+    assert policy.config["backbone"]["action_dim"] > space.width
+    stated = f"| action chunk | {space.horizon} steps of {space.width} numbers |"
+    assert stated in model_card(policy, policy.config)
+
+
 def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None:
     known = {
         "license": "apache-2.0",
@@ -70,11 +77,12 @@ def test_the_example_of_a_card_runs_to_an_action(
 
 @pytest.mark.parametrize("name", shipped_checkpoints())
 def test_the_example_of_a_shipped_card_runs_to_an_action(name: str) -> None:
-    (block,) = re.findall(
-        r"```python\n(.*?)```", (find_run(Path(name)) / "README.md").read_text(), re.DOTALL
-    )
+    card = (find_run(Path(name)) / "README.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
     space: dict = {}
     exec(block, space)
+    action = space["policy"].embodiment.action
+    assert f"| {action.horizon} steps of {action.width} numbers |" in card
     assert np.isfinite(space.get("chunk", space.get("choice"))).all()
 
 
