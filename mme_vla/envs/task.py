@@ -50,7 +50,7 @@ class Task(Stage):
         recovery: `z` or `xy` samples the pick that a recovery demonstration fails once.
         stress: how far dials are turned (`metadata.DIALS`); at 0 the scene is the benchmark's.
         in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
-        row: the scene's values (`metadata.SceneRow`); nothing is sampled then, and its `tier`, if
+        row: the scene's values (`mme_vla.envs.rows`); nothing is sampled then, and its `tier`, if
             it has one, brings the rules of RoboMME-OOD.
         second_tries: the demonstrator continues where the benchmark's own gives up; without it, it
             fails where that does.

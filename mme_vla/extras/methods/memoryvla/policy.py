@@ -90,7 +90,7 @@ class MemoryVlaPolicy(MethodPolicy):
         """Put the parts together; `processor`, `config` and `options` as for `NetworkPolicy`.
 
         Args:
-            core: with banks, or for a memory (`build_core`).
+            core: with banks, or for a memory (`RecallingCore`).
         """
         super().__init__(processor, config, **options)
         self.vlm, self.core, self.memory = vlm, core, memory

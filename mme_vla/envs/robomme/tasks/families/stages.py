@@ -200,7 +200,7 @@ def check_colour(env: Task, colour: str | RGB) -> None:
 def read_swaps[T: Thing](
     env: Task, things: Sequence[T], sample: Callable[[], list[int]], distinct: bool = True
 ) -> list[tuple[T, T | None]]:
-    """The swaps in order, as `swaps_in_turn` takes them: both objects of the row's pairs, or
+    """The swaps in order, as `consecutive_swaps` takes them: both objects of the row's pairs, or
     initiators alone, whose partner is whichever is nearest then.
 
     Args:
