@@ -482,7 +482,7 @@ def tables_of(card: Card) -> list[Table]:
         median = "no" if after.median is None else f"{after.median:g} decisions"
         text = (
             f"{median} (median); {after.recovered} of {after.recordings} within"
-            f" {after.decisions:.0f} decisions"
+            f" {after.decisions:.1f} decisions on average"
         )
         rows.append(["recovery after another scene", text])
     if card.writing is not None:

@@ -306,6 +306,12 @@ def test_recovery_counts_decisions_until_nothing_changes_any_more() -> None:
     assert recovery([]) is None
 
 
+def test_a_card_says_how_many_decisions_a_recording_has_on_average() -> None:
+    card = grade(scenes([1, 1]), {}, scenes([1, 1]))
+    text = card_text(replace(card, recovery=Recovery(None, 0, 6, 22 / 6)))
+    assert "no (median); 0 of 6 within 3.7 decisions on average" in text
+
+
 def test_a_card_without_another_scene_to_show_has_no_recovery(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
