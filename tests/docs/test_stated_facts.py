@@ -10,6 +10,8 @@ import yaml
 from helpers import REPOSITORY
 from mme_vla import evaluate
 from mme_vla.data.cache import default_cache_root
+from mme_vla.evaluation.records import RunKey
+from mme_vla.evaluation.rollout.evaluation import default_output
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.perturbation import _HOOKS, PROBE, TRAINING
 from mme_vla.serving.client import LARGEST_REPLY
@@ -29,6 +31,17 @@ def test_the_page_of_evaluation_names_the_keys_that_python_does_not_take() -> No
     content = yaml.safe_load(text_of(CONFIGS / "evaluate.yaml"))
     taken = {*inspect.signature(evaluate).parameters, *RolloutSettings.__annotations__}
     assert sorted(stated.split(", ")) == sorted({*content} - taken - {"defaults", "hydra"})
+
+
+def test_the_folder_of_an_evaluation_is_stated_with_all_its_parts() -> None:
+    facts = RunKey("pi05", 100, 7, split="ood", subgoal="oracle", memory_budget=64)
+    folder = default_output(facts).as_posix()
+    values = {"model": "pi05", "memory tokens": "64", "checkpoint": "100", "seed": "7"}
+    values |= {"subgoal": "oracle", "split": "ood"}
+    for stated in (CONFIGS / "evaluate.yaml", DOCS / "evaluate" / "evaluation.md"):
+        (form,) = re.findall(r"outputs/evaluation/<model>\[.*<split>\]", text_of(stated))
+        words = re.sub(r"[\[\]]", "", form)
+        assert re.sub(r"<([a-z ]+)>", lambda match: values[match[1]], words) == folder
 
 
 def test_the_page_of_events_lists_the_hooks_that_training_and_a_probe_call() -> None:

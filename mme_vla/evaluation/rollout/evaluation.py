@@ -267,7 +267,7 @@ def facts_of(
 
 def default_output(facts: RunKey) -> Path:
     """A folder that the same command finds again:
-    `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`, or `outputs/evaluation/nano/seed<seed>…`
+    `outputs/evaluation/<model>…/<checkpoint>/seed<seed>…`, or `outputs/evaluation/nano/seed<seed>…`
     of a shipped policy. A run that earlier versions began under its model's name continues there.
     """
     model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
