@@ -43,10 +43,9 @@ def model_card(policy: nn.Module, config: Mapping[str, Any], self_check: bool = 
             f"card[{key!r}]={brief(value)} must map names to values, such as {{'success (%)':"
             " 54.0}.",
         )
-    backbone = sections.backbone
-    network = backbone.get("name", "pi05")
-    if "depth" in backbone:
-        network += f", {backbone['depth']} layers"
+    network = sections.backbone.get("name", "pi05")
+    if "depth" in sections.backbone:
+        network += f", {sections.backbone['depth']} layers"
     robot = embodiment_of(config)
     rows = {
         "memory": _part(sections.memory),
