@@ -28,15 +28,15 @@ def follow(env: RouteStick, tip: Tip) -> list[Flags]:
     """Do every move as it is to be done."""
     return [
         circle(tip, *leg, direction)
-        for leg, direction in zip(pairwise(env.route), env.directions, strict=True)
+        for leg, direction in zip(pairwise(env.path), env.directions, strict=True)
     ]
 
 
 def watch(env: RouteStick, tip: Tip) -> None:
     """Go through the video and back to its first disc."""
-    tip.put(env.route[0])
+    tip.put(env.path[0])
     assert follow(env, tip) == [(False, False)] * len(env.directions)
-    tip.back_to_start(env.route[0])
+    tip.back_to_start(env.path[0])
     assert env.progress.index == len(env.directions) + 3
 
 
@@ -54,7 +54,7 @@ def test_routes_go_to_neighbours_and_may_return_only_where_they_may(env, monkeyp
     counts, returns, (moves, may_return) = set(), 0, MOVES[difficulty]
     for seed in range(100):
         env._draw_route(Draws(seed))
-        route = [env.discs.index(disc) for disc in env.route]
+        route = [env.discs.index(disc) for disc in env.path]
         assert (
             all(abs(a - b) == 1 for a, b in pairwise(route))
             and len(env.directions) == len(route) - 1
@@ -72,17 +72,17 @@ def test_the_same_route_again_is_success(env, tip):
 
 
 def test_a_target_is_reached_within_three_centimetres_and_below_fifteen(env, tip):
-    tip.put(env.route[0], aside=(0.02, 0))
+    tip.put(env.path[0], aside=(0.02, 0))
     assert env.progress.index == 0  # the first approach is exact
-    tip.put(env.route[0])
-    way = list(arc(env.route[0].position, env.route[1].position, env.directions[0]))
+    tip.put(env.path[0])
+    way = list(arc(env.path[0].position, env.path[1].position, env.directions[0]))
     for point in way[:30]:
         tip.put(point)
     for z, aside in ((0.151, 0), (0.149, 0.031)):
-        tip.put(env.route[1], z=z, aside=(aside, 0))
+        tip.put(env.path[1], z=z, aside=(aside, 0))
         assert env.progress.index == 1
     assert (
-        tip.put(env.route[1], z=0.149, aside=(0.029, 0)) == (False, False)
+        tip.put(env.path[1], z=0.149, aside=(0.029, 0)) == (False, False)
         and env.progress.index == 2
     )
 
@@ -90,8 +90,8 @@ def test_a_target_is_reached_within_three_centimetres_and_below_fifteen(env, tip
 @pytest.mark.parametrize("stage", ["video", "execution"])
 @pytest.mark.parametrize("move", [0, 1])
 def test_the_wrong_way_around_fails_at_the_target_and_stays_failed(env, tip, stage, move):
-    watch(env, tip) if stage == "execution" else tip.put(env.route[0])
-    legs = list(zip(pairwise(env.route), env.directions, strict=True))
+    watch(env, tip) if stage == "execution" else tip.put(env.path[0])
+    legs = list(zip(pairwise(env.path), env.directions, strict=True))
     for leg, direction in legs[:move]:
         assert circle(tip, *leg, direction) == (False, False)
     (start, goal), direction = legs[move]
@@ -103,7 +103,7 @@ def test_the_wrong_way_around_fails_at_the_target_and_stays_failed(env, tip, sta
 
 
 def test_every_disc_not_due_fails_even_one_hidden_under_an_obstacle(env, monkeypatch):
-    for place in set(env.all_discs) - set(env.route[:2]):
+    for place in set(env.all_discs) - set(env.path[:2]):
         env.reset()
         tip = Tip(env, monkeypatch)
         watch(env, tip)
@@ -112,7 +112,7 @@ def test_every_disc_not_due_fails_even_one_hidden_under_an_obstacle(env, monkeyp
 
 
 def test_a_target_is_highlighted_for_40_steps_after_the_tip_was_near(env, tip):
-    disc, mark = env.route[0], env._marks[env.discs.index(env.route[0])]
+    disc, mark = env.path[0], env._marks[env.discs.index(env.path[0])]
     tip.put(disc, aside=(0.029, 0))
     wait(env)
     tip.put((0.4, 0.4))

@@ -152,7 +152,7 @@ def test_the_next_move_of_the_route_is_highlighted_and_none_during_the_video() -
         if not 0 <= move < moves:
             assert discs == []
             continue
-        start, end = (disc.position for disc in env.route[move : move + 2])
+        start, end = (disc.position for disc in env.path[move : move + 2])
         way = arc(start, end, env.directions[move])[:, :2]
         assert np.allclose(discs[0], end[:2]) and len(discs) > 3
         assert all(np.linalg.norm(way - disc, axis=1).min() < 1e-6 for disc in discs)

@@ -145,7 +145,7 @@ def _unmask_swap(task: Any, ended: Mapping[int, Any]) -> set[str]:
 
 
 def _video_place(task: Any, ended: Mapping[int, Any]) -> set[str]:
-    return _key_poses("bc")(task, ended) | _moving("swap", task._swaps)
+    return _key_poses("bc")(task, ended) | _moving("swap", task.swaps)
 
 
 def _video_repick(task: Any, ended: Mapping[int, Any]) -> set[str]:

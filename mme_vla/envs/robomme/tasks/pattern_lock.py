@@ -10,23 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-from mme_vla.envs.robomme.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.robomme.scene.objects import Disc, build_disc
 from mme_vla.envs.robomme.scene.placement import Draws, SceneError
-from mme_vla.envs.robomme.scene.predicates import over
 from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.stages import end_stick_video, next_leg
-from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
-from mme_vla.envs.task import Task, candidates_among
+from mme_vla.envs.robomme.tasks.families.stick import StickTask
+from mme_vla.envs.subtasks import Choice, SubTask
 
 GRID = {"easy": 3, "medium": 4, "hard": 5}
 PATH_LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}
 CENTRE, SPACING = (-0.1, 0.0), 0.1
 NEIGHBOURS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1))  # (row, column)
-MARK_RADIUS, MARK_STEPS = 0.02004, 40
 TRIES = 1000
 DIRECTIONS = {
     "forward": (1, 0),
@@ -44,10 +39,8 @@ REACH = 0.2  # how far away the disc a direction means may lie
 
 
 @register_task
-class PatternLock(Task):
+class PatternLock(StickTask):
     """Rows of the grid run along x, columns along y."""
-
-    stick = True
 
     def build(self, draws: Draws) -> None:
         n = GRID[self.difficulty]
@@ -66,10 +59,7 @@ class PatternLock(Task):
             f"is {nodes}; expected a path over neighbours, {n} a row",
         )
         self.path = [self.discs[i] for i in nodes]
-        self._marks = [
-            build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(n * n)
-        ]
-        self._trace = Trace(self)
+        self.add_marks()
 
     def _draw_path(self, draws: Draws, n: int) -> list[int]:
         low, high = PATH_LENGTH[self.difficulty]
@@ -98,64 +88,41 @@ class PatternLock(Task):
                 return self.values.changed({"actions.path_nodes": other})
         return None
 
-    def candidates(self) -> Candidates | None:
-        """The neighbours of the disc that the next move starts from."""
-        leg = next_leg(self, self.path)
-        if leg is None:
-            return None
-        here, goal = leg
+    def beside(self, here: Disc) -> list[Disc]:
         nearest = SPACING * math.sqrt(2) + 1e-6
         neighbours = []
         for disc in self.discs:
             if disc is not here and distance_xy(disc.position, here.position) < nearest:
                 neighbours.append(disc)
-        return candidates_among(neighbours, [goal])
+        return neighbours
 
     def start_episode(self, draws: Draws) -> None:
-        self.marks = [
-            Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)
-        ]
-        self._trace.restart()
+        super().start_episode(draws)
         self.visited: list[Disc] = []
-
-    def after_step(self, k: int) -> None:
-        tcp = self.tcp_pose.p
-        for mark, disc in zip(self.marks, self.discs, strict=True):
-            mark.update(k, over(tcp, disc))
-        self._trace.update(k)
 
     def failure(self) -> bool:
         """Remembers which discs were visited; the rules belong to the moves."""
         current = self.progress.current
         if current is None or not current.video:
-            tcp = self.tcp_pose.p
-            self.visited += [d for d in self.discs if over(tcp, d) and self.visited[-1:] != [d]]
+            for disc in self.discs:
+                if self.visited_now(disc) and self.visited[-1:] != [disc]:
+                    self.visited.append(disc)
         return False
 
     def success(self) -> bool:
         return self.progress.succeeded and self.visited[-len(self.path) :] == self.path
 
-    def subtasks(self) -> list[SubTask]:
-        first = self.path[0]
-        approach = SubTask(
-            NO_RECORD,
-            done=lambda: over(self.tcp_pose.p, first),
-            run=lambda demo: demo.stick_to(first, store=True),
-            video=True,
-        )
-        legs = list(itertools.pairwise(self.path))
-        video_moves = [self._move(previous, goal, video=True) for previous, goal in legs]
-        moves = [self._move(previous, goal, video=False) for previous, goal in legs]
-        return [approach, *video_moves, *end_stick_video(self), *moves]
+    def moves(self, video: bool) -> list[SubTask]:
+        return [self._move(*leg, video) for leg in itertools.pairwise(self.path)]
 
     def _move(self, previous: Disc, goal: Disc, video: bool) -> SubTask:
         others = [disc for disc in self.discs if disc is not previous and disc is not goal]
         word = direction(goal.position - previous.position)
         return SubTask(
             f"move {word}",
-            done=lambda: over(self.tcp_pose.p, goal),
+            done=lambda: self.visited_now(goal),
             run=lambda demo: demo.stick_to(goal),
-            failed=lambda: any(over(self.tcp_pose.p, disc) for disc in others),
+            failed=lambda: any(self.visited_now(disc) for disc in others),
             choice=LETTERS[word],
             video=video,
             operation="order",

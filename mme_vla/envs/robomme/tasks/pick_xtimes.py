@@ -2,58 +2,39 @@
 button.
 """
 
+from typing import ClassVar
+
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, row, tally
 from mme_vla.envs.robomme.scene.objects import H
 from mme_vla.envs.robomme.scene.placement import Draws, Region
 from mme_vla.envs.robomme.scene.predicates import any_picked_up, pressed
 from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.repetitions import RepetitionTask
 from mme_vla.envs.robomme.tasks.families.stages import (
-    SAMPLED_COLOURS,
-    add_button,
-    add_cubes,
-    add_distractors,
     add_target,
-    choose_cube,
     pick,
     place,
     press,
     press_choice,
-    sample_colours,
-    sample_repetitions,
 )
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
-from mme_vla.envs.task import Task
 
-CUBES = {"easy": 1, "medium": 3, "hard": 3}
-REPETITIONS = {"easy": (1, 3), "medium": (1, 3), "hard": (4, 5)}  # fewest and most
-TABLE = Region((-0.1, 0.0), 0.2)
 TARGET_RADIUS = 0.04
 
 
 @register_task
-class PickXtimes(Task):
+class PickXtimes(RepetitionTask):
     """One cube is picked up and placed on the target again and again, as often as the goal says."""
 
-    latch_failure = True
-    fact_choices = "b"
+    bounds: ClassVar = {"easy": (1, 3), "medium": (1, 3), "hard": (4, 5)}
+    region = Region((-0.1, 0.0), 0.2)
 
-    def plan(self, draws: Draws) -> None:
-        self.repetitions = sample_repetitions(self, draws, REPETITIONS[self.difficulty])
-
-    def build(self, draws: Draws) -> None:
-        self.button = add_button(self, draws, (-0.2, 0.0))
-        colours = sample_colours(self, draws, SAMPLED_COLOURS)[: CUBES[self.difficulty]]
-        draws.integer(0, 3)  # part of the official stream, without effect
-        self.cubes = add_cubes(self, draws, colours, TABLE, [self.button])
+    def add_targets(self, draws: Draws) -> None:
         avoid = [self.button, *self.cubes]
         self.target = add_target(
-            self, draws, "target", "layout.goal_xy", TABLE, TARGET_RADIUS, avoid, gap=2 * H
+            self, draws, "target", "layout.goal_xy", self.region, TARGET_RADIUS, avoid, gap=2 * H
         )
-        self.cube = choose_cube(self, draws, self.cubes)
-        self.distractors = add_distractors(self, draws, TABLE)
-        self.all_cubes = [*self.cubes, *self.distractors]
-        self.wrong_cubes = [cube for cube in self.all_cubes if cube is not self.cube]
 
     def cues(self) -> list[Cue]:
         def left() -> int:

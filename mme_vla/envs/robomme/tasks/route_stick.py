@@ -9,23 +9,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator, arc
-from mme_vla.envs.robomme.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
+from mme_vla.envs.robomme.scene.motions import Cue, Place, on_table
 from mme_vla.envs.robomme.scene.objects import Disc, build_disc, build_obstacle
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.scene.predicates import over
 from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.stages import end_stick_video, next_leg
-from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
-from mme_vla.envs.task import Task, candidates_among
+from mme_vla.envs.robomme.tasks.families.stick import StickTask
+from mme_vla.envs.subtasks import Choice, SubTask
 
 PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
 MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
-REACH_RADIUS, REACH_HEIGHT = 0.03, 0.15
-MARK_RADIUS, MARK_STEPS = 0.02004, 40
-HOME_STEPS = 200
 CUE_RADIUS, DOT_RADIUS = 0.04, 0.01
 DOTS = range(8, 40, 7)  # of an arc's 45 points
 MOVE = "move to the nearest {} target by circling around the stick {}"
@@ -40,10 +35,11 @@ SIDES: tuple[tuple[str, Direction], ...] = (
 
 
 @register_task
-class RouteStick(Task):
+class RouteStick(StickTask):
     """Five discs in a row with an obstacle between each two; left is the larger y."""
 
-    stick = True
+    visit = (0.03, 0.15)
+    home_steps = 200
     latch_failure = True
 
     def build(self, draws: Draws) -> None:
@@ -66,8 +62,7 @@ class RouteStick(Task):
             self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, colour))
         self.discs = self.all_discs[::2]
         self._draw_route(draws)
-        self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(5)]
-        self._dots = Trace(self)
+        self.add_marks()
 
     def _draw_route(self, draws: Draws) -> None:
         """The row's route and turns, or random ones."""
@@ -85,7 +80,7 @@ class RouteStick(Task):
         def sample() -> list[str]:
             return ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
 
-        self.route = [self.discs[i] for i in route]
+        self.path = [self.discs[i] for i in route]
         self.directions: list[Direction] = values.words("actions.turns", sample, TURNS)  # type: ignore[assignment]
         count = len(self.directions)
         values.require(count == moves, "actions.turns", f"has {count} turns for {moves} moves")
@@ -105,21 +100,15 @@ class RouteStick(Task):
         """The route mirrored at its first disc, with the same turns; None where it leaves the
         discs.
         """
-        route = [self.discs.index(disc) for disc in self.route]
+        route = [self.discs.index(disc) for disc in self.path]
         mirrored = [2 * route[0] - i for i in route]
         if not all(0 <= i < len(self.discs) for i in mirrored):
             return None
         return self.values.changed({"actions.route": mirrored})
 
-    def candidates(self) -> Candidates | None:
-        """The discs beside the one that the next move starts from."""
-        leg = next_leg(self, self.route)
-        if leg is None:
-            return None
-        here, goal = leg
+    def beside(self, here: Disc) -> list[Disc]:
         i = self.discs.index(here)
-        beside = self.discs[max(i - 1, 0) : i] + self.discs[i + 1 : i + 2]
-        return candidates_among(beside, [goal])
+        return self.discs[max(i - 1, 0) : i] + self.discs[i + 1 : i + 2]
 
     def cues(self) -> list[Cue]:
         """Of the next move: a disc under its target, and smaller ones along its arc."""
@@ -133,22 +122,13 @@ class RouteStick(Task):
         move = len(self.directions) - len(self.progress.to_come)
         if not 0 <= move < len(self.directions):  # in the video, or at the end
             return None
-        start, end = self.route[move].position, self.route[move + 1].position
+        start, end = self.path[move].position, self.path[move + 1].position
         return on_table(arc(start, end, self.directions[move])[i])
 
     def start_episode(self, draws: Draws) -> None:
-        self.marks = [
-            Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)
-        ]
-        self._dots.restart()
+        super().start_episode(draws)
         self._way: list[np.ndarray] = []
         self._way_of: SubTask | None = None
-
-    def after_step(self, k: int) -> None:
-        tcp = self.tcp_pose.p
-        for mark, disc in zip(self.marks, self.discs, strict=True):
-            mark.update(k, over(tcp, disc, REACH_RADIUS, REACH_HEIGHT))
-        self._dots.update(k)
 
     def failure(self) -> bool:
         """Remembers the way of the tool since the last visit; the rules belong to the moves."""
@@ -166,38 +146,27 @@ class RouteStick(Task):
         chord = goal.position[:2] - previous.position[:2]
         return "clockwise" if chord[0] * way[1] - chord[1] * way[0] > 0 else "counterclockwise"
 
-    def subtasks(self) -> list[SubTask]:
-        first = self.route[0]
-        approach = SubTask(
-            NO_RECORD,
-            done=lambda: over(self.tcp_pose.p, first),
-            run=lambda demo: demo.stick_to(first, store=True),
-            video=True,
-        )
-        legs = list(zip(self.route, self.route[1:], self.directions, strict=False))
-        video_moves = [self._move(*leg, video=True) for leg in legs]
-        moves = [self._move(*leg, video=False) for leg in legs]
-        return [approach, *video_moves, *end_stick_video(self, HOME_STEPS), *moves]
+    def moves(self, video: bool) -> list[SubTask]:
+        legs = zip(self.path, self.path[1:], self.directions, strict=False)
+        return [self._move(*leg, video) for leg in legs]
 
     def _move(self, previous: Disc, goal: Disc, direction: Direction, video: bool) -> SubTask:
         others = [disc for disc in self.all_discs if disc is not previous and disc is not goal]
         side = "left" if goal.position[1] > previous.position[1] else "right"
 
-        def there() -> bool:
-            return over(self.tcp_pose.p, goal, REACH_RADIUS, REACH_HEIGHT)
-
         def failed() -> bool:
-            astray = any(over(self.tcp_pose.p, disc) for disc in others)
-            return astray or (there() and self._turned(previous, goal) != direction)
+            if any(over(self.tcp_pose.p, disc) for disc in others):
+                return True
+            return self.visited_now(goal) and self._turned(previous, goal) != direction
 
         return SubTask(
             MOVE.format(side, direction),
-            done=there,
+            done=lambda: self.visited_now(goal),
             run=lambda demo: demo.stick_arc(goal, direction),
             failed=failed,
             choice="abcd"[SIDES.index((side, direction))],
             video=video,
-            operation=lambda: "how" if there() else "order",
+            operation=lambda: "how" if self.visited_now(goal) else "order",
         )
 
     def choices(self) -> list[Choice]:

@@ -2,6 +2,8 @@
 the button.
 """
 
+from typing import ClassVar
+
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import TALLY_SPACING, Cue, Mark, build_mark, tally
 from mme_vla.envs.robomme.scene.objects import Cube, Disc, H
@@ -9,27 +11,17 @@ from mme_vla.envs.robomme.scene.placement import Draws, Region
 from mme_vla.envs.robomme.scene.predicates import any_picked_up, pressed
 from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.repetitions import RepetitionTask
 from mme_vla.envs.robomme.tasks.families.stages import (
-    SAMPLED_COLOURS,
-    add_button,
-    add_cubes,
-    add_distractors,
     add_target,
-    choose_cube,
     pick,
     press,
     press_choice,
     put_down,
     put_down_choice,
-    sample_colours,
-    sample_repetitions,
 )
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
-from mme_vla.envs.task import Task
 
-SWINGS = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
-CUBES = {"easy": 1, "medium": 3, "hard": 3}
-TABLE = Region((-0.1, 0), 0.25)
 TARGET_RADIUS = 0.04
 NEAR, LEFT = 0.03, 0.04  # a swing is entered within the first distance and left beyond the second
 LOW, HIGH = 0.12, 0.3  # likewise for the cube's height
@@ -63,20 +55,13 @@ class Swings:
 
 
 @register_task
-class SwingXtimes(Task):
+class SwingXtimes(RepetitionTask):
     """The cube goes right, then left, `repetitions` times."""
 
-    latch_failure = True
-    fact_choices = "b"
+    bounds: ClassVar = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
+    region = Region((-0.1, 0), 0.25)
 
-    def plan(self, draws: Draws) -> None:
-        self.repetitions = sample_repetitions(self, draws, SWINGS[self.difficulty])
-
-    def build(self, draws: Draws) -> None:
-        self.button = add_button(self, draws, (-0.2, 0))
-        colours = sample_colours(self, draws, SAMPLED_COLOURS)[: CUBES[self.difficulty]]
-        draws.integer(0, 3)  # part of the official stream, without effect
-        self.cubes = add_cubes(self, draws, colours, TABLE, [self.button])
+    def add_targets(self, draws: Draws) -> None:
         targets: list[Disc] = []
         for i, y in enumerate((-0.2, 0.2)):
             target = add_target(
@@ -93,10 +78,9 @@ class SwingXtimes(Task):
             targets.append(target)
         # Right and left as the robot sees them.
         self.right, self.left = sorted(targets, key=lambda target: target.position[1])
-        self.cube = choose_cube(self, draws, self.cubes)
-        self.distractors = add_distractors(self, draws, TABLE)
-        self.all_cubes = [*self.cubes, *self.distractors]
-        self.wrong_cubes = [cube for cube in self.all_cubes if cube is not self.cube]
+
+    def build(self, draws: Draws) -> None:
+        super().build(draws)
         self._marks = [build_mark(self, f"mark_{i}", TARGET_RADIUS * 1.003, 0.014) for i in (0, 1)]
 
     def start_episode(self, draws: Draws) -> None:

@@ -11,7 +11,6 @@ from mme_vla.envs.robomme.scene.motions import (
     SWAP_STEPS,
     Cue,
     Swap,
-    active_motions,
     consecutive_swaps,
     row,
     tally,
@@ -23,6 +22,7 @@ from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up, pres
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
     SAMPLED_COLOURS,
+    VideoSwaps,
     add_button,
     add_cube,
     delay,
@@ -37,7 +37,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     wait,
 )
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
-from mme_vla.envs.task import Task
 
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes
@@ -48,7 +47,7 @@ PRESS_PUNISHED = (50, 500)  # steps since the kind of stage was first entered
 
 
 @register_task
-class VideoRepick(Task):
+class VideoRepick(VideoSwaps):
     """Three cubes of one colour that change places, or fifteen that do not."""
 
     shared_draws = True
@@ -124,15 +123,11 @@ class VideoRepick(Task):
         )
 
     def start_episode(self, draws: Draws) -> None:
-        self.swaps: list[Swap] = []
-        self._swaps_due = False
+        super().start_episode(draws)
         self._entered: dict[str, int] = {}
 
-    def before_physics(self, k: int) -> None:
-        if self._swaps_due and not self.swaps:
-            self.swaps = consecutive_swaps(self.swapped, self.cubes, start=k)
-            self.motions = [*self.swaps]
-        super().before_physics(k)
+    def make_swaps(self, start: int) -> list[Swap]:
+        return consecutive_swaps(self.swapped, self.cubes, start)
 
     def flip_fact(self) -> dict[str, Any] | None:
         """The video picks up the next cube instead."""
@@ -149,25 +144,15 @@ class VideoRepick(Task):
         return [under(self.cube), *tally(row(self.repetitions), left)]
 
     def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
-        facts = super().visible_facts(ended) | active_motions(self.swaps)
+        facts = super().visible_facts(ended)
         for i, subtask in ended.items():
             if subtask.choice == "b" and not subtask.video:  # one repetition is done
                 facts[f"{i} {subtask.text}"] = self.count_fact(i)
         return facts
 
-    def failure(self) -> bool:
-        """Notes whether the swaps may begin, one step after their stage is entered; the rules
-        belong to the stages.
-        """
-        self._swaps_due = self._swap_stage is not None and self.progress.current is self._swap_stage
-        return False
-
     def subtasks(self) -> list[SubTask]:
-        return [*self._video(), *self._execution()]
-
-    def _video(self) -> list[SubTask]:
         swaps = [self._swap_wait(i) for i in range(self.swap_count)]
-        self._swap_stage = swaps[0] if swaps else None
+        self.swap_stage = swaps[0] if swaps else None
         steps = [
             pick(self, self.cube, "pick up the cube", grounded="", video=True),
             put_down(
@@ -177,7 +162,17 @@ class VideoRepick(Task):
         longer = delay(self)
         if swaps or longer:
             steps.append(go_home(self, GO_HOME_STEPS + longer))
-        return [*steps, *swaps, end_video(self)]
+        steps += [*swaps, end_video(self)]
+        for i in range(self.repetitions):
+            steps += self._repetition(i)
+        stop = press(
+            self.button,
+            "press the button to finish",
+            "c",
+            failed=lambda: any_picked_up(self, self.cubes),
+            operation="how many",
+        )
+        return [*steps, stop]
 
     def _swap_wait(self, i: int) -> SubTask:
         """Hold still for a swap; in RoboMME-OOD until it ends."""
@@ -196,19 +191,6 @@ class VideoRepick(Task):
             return at_rest and bool(self.swaps) and self.steps_done >= self.swaps[i].end
 
         return SubTask("static", done, run, video=True)
-
-    def _execution(self) -> list[SubTask]:
-        steps: list[SubTask] = []
-        for i in range(self.repetitions):
-            steps += self._repetition(i)
-        stop = press(
-            self.button,
-            "press the button to finish",
-            "c",
-            failed=lambda: any_picked_up(self, self.cubes),
-            operation="how many",
-        )
-        return [*steps, stop]
 
     def _repetition(self, i: int) -> list[SubTask]:
         return [

@@ -1,12 +1,15 @@
 """Sub-tasks, options and placements that several tasks share."""
 
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypedDict, Unpack
 
 import numpy as np
 
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.articulated import BUTTON_BASE, Button, build_button
+from mme_vla.envs.robomme.scene.motions import Swap, active_motions
 from mme_vla.envs.robomme.scene.objects import COLOURS, RGB, Cube, Disc, H, build_cube, build_disc
 from mme_vla.envs.robomme.scene.placement import (
     Avoid,
@@ -25,7 +28,6 @@ from mme_vla.envs.robomme.scene.predicates import (
     pressed,
     reset_reached,
 )
-from mme_vla.envs.robomme.scene.stage import RESET_QPOS
 from mme_vla.envs.robomme.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
@@ -70,51 +72,29 @@ def add_cubes(
     env: Task, draws: Draws, colours: Sequence[str], region: Region, avoid: Sequence[Avoid]
 ) -> list[Cube]:
     """Add the cubes of the row, or one of each of these colours; they keep clear of each other."""
-    names = [f"{colour}_0" for colour in colours]
+    names = [(f"{colour}_0", colour) for colour in colours]
     if env.values.specified:
-        names = _cube_names(env, "layout.cubes")
+        names = names_with_colours(env, "layout.cubes")
     cubes: list[Cube] = []
-    for name in names:
-        colour = name.split("_")[0]
+    for name, colour in names:
         value = f"layout.cubes.{name}"
         taken = [*avoid, *cubes]
         cubes.append(add_cube(env, draws, f"cube_{colour}", colour, region, taken, value=value))
     return cubes
 
 
-def add_distractors(env: Task, draws: Draws, region: Region) -> list[Cube]:
-    """Add the cubes of other colours that a row has: each is a wrong cube."""
-    cubes: list[Cube] = []
-    if env.values.specified:
-        for name in _cube_names(env, "layout.distractors"):
-            colour = name.split("_")[0]
-            value = f"layout.distractors.{name}"
-            cubes.append(
-                add_cube(env, draws, f"distractor_{name}", colour, region, [], value=value)
-            )
-    return cubes
-
-
-def _cube_names(env: Task, part: str) -> list[str]:
-    """Names such as `red_0` of the cubes in a part of the row."""
-    names = env.values.names(part)
-    for name in names:
+def names_with_colours(env: Task, part: str) -> list[tuple[str, str]]:
+    """Names such as `red_0` of the cubes in a part of the row, each with its colour."""
+    names = []
+    for name in env.values.names(part):
+        colour = name.split("_")[0]
         env.values.require(
-            name.split("_")[0] in COLOURS,
+            colour in COLOURS,
             f"{part}.{name}",
             f"has an unknown colour; expected one of {', '.join(COLOURS)}",
         )
+        names.append((name, colour))
     return names
-
-
-def choose_cube(env: Task, draws: Draws, cubes: Sequence[Cube]) -> Cube:
-    """The cube that the goal is about: the row's, or a random one of these."""
-    count = len(cubes)
-    index = env.values.integer(
-        "objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1
-    )
-    check_colour(env, cubes[index].colour)
-    return cubes[index]
 
 
 def add_button(
@@ -163,18 +143,6 @@ def add_target(
 # Values -------------------------------------------------------------------------------------------
 
 
-def sample_repetitions(env: Task, draws: Draws, bounds: tuple[int, int]) -> int:
-    """How often something is to be done: by the row, or at random from the fewest to the most, and
-    what the dial `count` adds.
-    """
-    fewest, most = bounds
-    return env.values.integer(
-        "objects.num_repeats",
-        lambda: draws.integer(fewest, most + 1) + env.turned("count"),
-        least=1,
-    )
-
-
 def sample_colours(env: Task, draws: Draws, order: Sequence[str]) -> list[str]:
     """The colours in the row's order, or in a random one."""
     numbers = env.values.indices(
@@ -195,6 +163,35 @@ def check_colour(env: Task, colour: str | RGB) -> None:
         "objects.target_color",
         f"is {stated!r}; the other values give {colour!r}",
     )
+
+
+class VideoSwaps(Task):
+    """A task in whose video objects change places, from the step after a stage is entered."""
+
+    swap_stage: SubTask | None
+    """Set by `subtasks`; None where nothing changes places."""
+
+    @abstractmethod
+    def make_swaps(self, start: int) -> list[Swap]:
+        """The swaps of the episode, the first of which begins at step `start`."""
+
+    def start_episode(self, draws: Draws) -> None:
+        self.swaps: list[Swap] = []
+        self._swaps_due = False
+
+    def failure(self) -> bool:
+        """Notes whether the swaps may begin; the rules belong to the stages."""
+        self._swaps_due = self.swap_stage is not None and self.progress.current is self.swap_stage
+        return False
+
+    def before_physics(self, k: int) -> None:
+        if self._swaps_due and not self.swaps:
+            self.swaps = self.make_swaps(k)
+            self.motions = [*self.swaps]
+        super().before_physics(k)
+
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
+        return super().visible_facts(ended) | active_motions(self.swaps)
 
 
 def read_swaps[T: Thing](
@@ -337,37 +334,6 @@ def end_video(env: Task) -> SubTask:
         run=lambda demo: demo.hard_reset(),
         video=True,
     )
-
-
-def end_stick_video(env: Task, steps: int = 30) -> list[SubTask]:
-    """Drive the arm home, and then to where its first approach ended."""
-    return [
-        SubTask(
-            NO_RECORD,
-            done=lambda: env.after_video and reset_reached(env, RESET_QPOS),
-            run=lambda demo: demo.hard_reset(steps),
-            video=True,
-        ),
-        SubTask(
-            NO_RECORD,
-            done=lambda: env.stored_qpos is not None and reset_reached(env, env.stored_qpos),
-            run=lambda demo: demo.hard_reset(qpos=env.stored_qpos),
-            video=True,
-        ),
-    ]
-
-
-def next_leg(env: Task, path: Sequence[Disc]) -> tuple[Disc, Disc] | None:
-    """The discs where the stick's next move of the execution starts and ends; None in the video and
-    at the end.
-
-    path: of the execution, whose last sub-tasks are its moves.
-    """
-    subtask = env.progress.current
-    if subtask is None or subtask.video:
-        return None
-    remaining = len(env.progress.to_come)
-    return path[-remaining - 1], path[-remaining]
 
 
 # Options of multi-choice --------------------------------------------------------------------------

@@ -3,20 +3,19 @@ of them again.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import ClassVar
 
 import sapien
 
-from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-from mme_vla.envs.robomme.scene.motions import Cue, Swap, active_motions, under
+from mme_vla.envs.robomme.scene.motions import Cue, Swap, under
 from mme_vla.envs.robomme.scene.objects import Cube, Disc, H
 from mme_vla.envs.robomme.scene.placement import Avoid, Draws, Region
 from mme_vla.envs.robomme.scene.predicates import any_picked_up, dropped, dropped_onto
 from mme_vla.envs.robomme.scene.things import Thing
 from mme_vla.envs.robomme.tasks.families.stages import (
     SAMPLED_COLOURS,
+    VideoSwaps,
     add_button,
     add_cubes,
     add_target,
@@ -32,7 +31,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     wait,
 )
 from mme_vla.envs.subtasks import Choice, SubTask
-from mme_vla.envs.task import Task
 
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 TARGET_RADIUS = 0.04
@@ -46,7 +44,6 @@ class Place(Thing):
     """Where an object stood at first: a place without a body."""
 
     def __init__(self, thing: Thing) -> None:
-        self.name = f"{thing.name}_home"
         self._at = thing.initial_pose
 
     @property
@@ -54,7 +51,7 @@ class Place(Thing):
         return self._at
 
 
-class VideoPlace(Task):
+class VideoPlace(VideoSwaps):
     """The cube visits targets, then a spot of the table; in hard episodes two targets then change
     places.
     """
@@ -138,34 +135,16 @@ class VideoPlace(Task):
     def goal_target(self) -> Disc:
         """Where the cube belongs."""
 
-    def start_episode(self, draws: Draws) -> None:
-        self._homes = {cube: Place(cube) for cube in self.cubes}
-        self._swaps: list[Swap] = []
-        self._swap_due = False
-
-    def before_physics(self, k: int) -> None:
-        if self._swap_due and not self._swaps:
-            first, second = self._swapped
-            swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
-            self._swaps = [swap]
-            self.motions = [swap]
-        super().before_physics(k)
+    def make_swaps(self, start: int) -> list[Swap]:
+        first, second = self._swapped
+        return [Swap(first, self.targets, start, SWAP_LANE, second)]
 
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
 
-    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
-        return super().visible_facts(ended) | active_motions(self._swaps)
-
-    def failure(self) -> bool:
-        """Notes whether the swap may begin, one step after its stage is entered; the rules belong
-        to the stages.
-        """
-        self._swap_due = bool(self._swapped) and self.progress.current is self._swap_stage
-        return False
-
     def subtasks(self) -> list[SubTask]:
-        self._swap_stage = wait(self, SWAP_STAGE_STEPS)
+        stage = wait(self, SWAP_STAGE_STEPS)
+        self.swap_stage = stage if self._swapped else None
         steps = self.visits()
         if not self.tier:
             drop = SubTask(
@@ -176,11 +155,11 @@ class VideoPlace(Task):
             )
             steps += [self.show_pick(self.cube), drop]
         home = go_home(self, GO_HOME_STEPS + delay(self))
-        return [*steps, home, self._swap_stage, end_video(self), *self._execution()]
+        return [*steps, home, stage, end_video(self), *self._execution()]
 
     def put_back(self, cube: Cube) -> list[SubTask]:
         """Pick the cube up in the video and put it where it stood at first, as in RoboMME-OOD."""
-        home = self._homes[cube]
+        home = Place(cube)
         put = SubTask(
             "put the cube back to its original position",
             done=lambda: dropped_onto(self, cube, home),
