@@ -190,7 +190,13 @@ class RoboMMEEnv(gymnasium.Env):
         with task.as_recorded():
             for subtask in task.progress.subtasks:
                 if subtask.video:
-                    self._demonstrate(subtask)
+                    # Evaluated before and after it, as at recording.
+                    task.evaluate_planned()
+                    try:
+                        subtask.run(run.demonstrator)
+                    except PlanningError as error:  # the rest of the video follows, as officially
+                        log.info("conditioning video: %r failed: %s", subtask.text, error)
+                    task.evaluate_planned()
         run.in_video = False
         task.unrecorded_steps = 1
         self._step_control(task.start_action)
@@ -418,15 +424,6 @@ class RoboMMEEnv(gymnasium.Env):
             if run.terminated:
                 break
         run.demonstrator.left = 0
-
-    def _demonstrate(self, subtask: "SubTask") -> None:
-        """Carry out a sub-task of the video, evaluating before and after it as at recording."""
-        self.task.evaluate_planned()
-        try:
-            subtask.run(self._require_run().demonstrator)
-        except PlanningError as error:  # the benchmark continues with the rest of the video
-            log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
-        self.task.evaluate_planned()
 
     # Info and status ------------------------------------------------------------------------------
 

@@ -183,7 +183,7 @@ class Observer:
     def extrinsic(self, name: str) -> np.ndarray:
         """World to camera in OpenCV's axes, float32 [3, 4], of `front` or `wrist`."""
         if name == "front":
-            return front_extrinsic()
+            return front_extrinsic().copy()
         pose = self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
         world_to_camera = np.asarray(pose.inv().to_transformation_matrix(), np.float64)
         return (_OPENCV @ world_to_camera[:3]).astype(np.float32)
@@ -227,13 +227,9 @@ def read_images(
     return {name: np.ascontiguousarray(images[name].cpu().numpy()) for name in requested}
 
 
+@cache
 def front_extrinsic() -> np.ndarray:
     """World-to-camera matrix of the front camera, float32 [3, 4]; it never moves."""
-    return _front_extrinsic().copy()
-
-
-@cache
-def _front_extrinsic() -> np.ndarray:
     forward = _FRONT_TARGET - _FRONT_EYE
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1])
@@ -246,13 +242,9 @@ def as_lists(frames: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[str,
     """The benchmark's observation: for each key the values of all frames, in time order."""
     lists = {}
     for key in keys:
-        lists[list_key(key)] = [frame[key] for frame in frames]
+        name = key if key == "maniskill_obs" else f"{key}_list"
+        lists[name] = [frame[key] for frame in frames]
     return lists
-
-
-def list_key(key: str) -> str:
-    """`front_rgb_list` for `front_rgb`."""
-    return key if key == "maniskill_obs" else f"{key}_list"
 
 
 def frame_keys(include: Include, render: bool) -> list[str]:

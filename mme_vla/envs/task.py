@@ -12,12 +12,13 @@ from functools import partial
 from numbers import Integral
 from typing import Any, ClassVar
 
+import sapien
 import torch
 
 from mme_vla.envs.facts import Candidates, VisibleFact
 from mme_vla.envs.metadata import dials_of
-from mme_vla.envs.robomme.scene.motions import Cue, Motion, build_cue, show_cue
-from mme_vla.envs.robomme.scene.objects import Disc
+from mme_vla.envs.robomme.scene.motions import CUE_COLOURS, CUE_HALF_LENGTH, Cue, Motion
+from mme_vla.envs.robomme.scene.objects import BELOW_TABLE, Disc, build_highlight
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.scene.stage import Stage
 from mme_vla.envs.robomme.scene.things import Thing
@@ -254,7 +255,9 @@ class Task(Stage):
         self._cues: list[tuple[Disc, Cue]] = []
         if self.in_view:
             for i, cue in enumerate(self.cues()):
-                self._cues.append((build_cue(self, f"cue_{i}", cue), cue))
+                colour = CUE_COLOURS[cue.colour]
+                disc = build_highlight(self, f"cue_{i}", cue.radius, CUE_HALF_LENGTH, colour)
+                self._cues.append((disc, cue))
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
@@ -326,7 +329,8 @@ class Task(Stage):
 
     def _show_cues(self) -> None:
         for disc, cue in self._cues:
-            show_cue(disc, cue)
+            place = cue.place()
+            disc.move_to(sapien.Pose(BELOW_TABLE if place is None else place, disc.pose.q))
 
     def evaluate_planned(self) -> None:
         """Evaluate once before or after a sub-task's routine, where the demonstrator's pointer

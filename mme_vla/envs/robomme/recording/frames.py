@@ -88,17 +88,16 @@ class FrameChoice:
         }
 
     def _frame_numbers(self, steps: Sequence["RecordedStep"], video: int) -> list[int]:
-        if isinstance(self.at, int):
-            return list(range(video, len(steps), self.at))
-        if self.at == DECISIONS:
-            decisions: list[int] = motions_of(steps).decisions[:: self.every].tolist()
-            return decisions
-        if self.at == CHOICES:
-            choices: list[int] = choices_of(steps).decisions.tolist()
-            return choices
         numbers: list[int] = []
-        for span in spans(self.at, "frames", GRAMMAR):
-            numbers += [number for number in span if number < len(steps)]
+        if isinstance(self.at, int):
+            numbers += range(video, len(steps), self.at)
+        elif self.at == DECISIONS:
+            numbers += motions_of(steps).decisions[:: self.every].tolist()
+        elif self.at == CHOICES:
+            numbers += choices_of(steps).decisions.tolist()
+        else:
+            for span in spans(self.at, "frames", GRAMMAR):
+                numbers += [number for number in span if number < len(steps)]
         return numbers
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import sapien
 
-from mme_vla.envs.robomme.robot.control import CLOSE, OPEN, PlanningError, RobotControl
+from mme_vla.envs.robomme.robot.control import CLOSE, OPEN, PlanningError
 from mme_vla.envs.robomme.robot.gripper_skills import GripperPrimitives, pointing_down, turned
 from mme_vla.envs.robomme.robot.robots import ROBOT_BASE
 from mme_vla.envs.robomme.scene.articulated import Peg
@@ -31,8 +31,25 @@ one's height.
 """
 
 
-class PegPrimitives(RobotControl):
-    """The primitives of tasks in which cubes are moved along the table and pegs are handled."""
+STICK_Z = 0.07
+"""Height of the tip of the stick while it moves from target to target, metres."""
+ARC_OFFSET = 0.2
+"""How far the control point of an arc lies beside the middle of its chord, metres."""
+ARC_SAMPLES, ARC_HOLD = 45, 5
+
+
+class Demonstrator(GripperPrimitives):
+    """Performs the primitives that demonstrations and multi-choice options are made of.
+
+    Motions are planned from where the arm is and carried out without looking; the same scene gives
+    the same steps. Waypoints are announced before the motion that leads there.
+
+    Example:
+        >>> demonstrator = Demonstrator(env, env.step)  # doctest: +SKIP
+        >>> demonstrator.pick(env.cubes[0])  # doctest: +SKIP
+    """
+
+    # Cubes on the table, and pegs -----------------------------------------------------------------
 
     _reversed = False
     """The peg was grasped half a turn about the tool's approach axis from its own frame."""
@@ -179,30 +196,7 @@ class PegPrimitives(RobotControl):
         """Move the tool straight up."""
         self.move_to(self.at([*self.env.tcp_pose.p[:2], ABOVE_PEG]))
 
-
-def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
-    """The tool's pose around one end of a peg, moved along the peg by `outward` metres."""
-    q = turned(end.pose.q, "x", np.pi)
-    if flip:
-        q = turned(q, "z", np.pi)
-    along = end.pose.to_transformation_matrix()[:3, 0]
-    return sapien.Pose(end.position + outward * along, q)
-
-
-def _direction(cube: Thing, goal: Thing) -> np.ndarray:
-    way = goal.position[:2] - cube.position[:2]
-    return way / np.linalg.norm(way)
-
-
-STICK_Z = 0.07
-"""Height of the tip while it moves from target to target, metres."""
-ARC_OFFSET = 0.2
-"""How far the control point of an arc lies beside the middle of its chord, metres."""
-ARC_SAMPLES, ARC_HOLD = 45, 5
-
-
-class StickPrimitives(RobotControl):
-    """The primitives of tasks in which a stick is moved over targets."""
+    # The stick ------------------------------------------------------------------------------------
 
     def stick_to(self, target: Thing, store: bool = False) -> None:
         """Move the tip over a target, in a straight line and then once more to be exact.
@@ -243,6 +237,20 @@ class StickPrimitives(RobotControl):
         self.follow(targets[middle:])
 
 
+def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
+    """The tool's pose around one end of a peg, moved along the peg by `outward` metres."""
+    q = turned(end.pose.q, "x", np.pi)
+    if flip:
+        q = turned(q, "z", np.pi)
+    along = end.pose.to_transformation_matrix()[:3, 0]
+    return sapien.Pose(end.position + outward * along, q)
+
+
+def _direction(cube: Thing, goal: Thing) -> np.ndarray:
+    way = goal.position[:2] - cube.position[:2]
+    return way / np.linalg.norm(way)
+
+
 def arc(
     start: np.ndarray, end: np.ndarray, direction: Literal["clockwise", "counterclockwise"]
 ) -> np.ndarray:
@@ -265,15 +273,3 @@ def arc(
     t = np.linspace(0, 1, ARC_SAMPLES)[:, None]
     points = (1 - t) ** 2 * a + 2 * t * (1 - t) * control + t**2 * b
     return np.column_stack([points, np.full(ARC_SAMPLES, STICK_Z)])
-
-
-class Demonstrator(GripperPrimitives, PegPrimitives, StickPrimitives):
-    """Performs the primitives that demonstrations and multi-choice options are made of.
-
-    Motions are planned from where the arm is and carried out without looking; the same scene gives
-    the same steps. Waypoints are announced before the motion that leads there.
-
-    Example:
-        >>> demonstrator = Demonstrator(env, env.step)  # doctest: +SKIP
-        >>> demonstrator.pick(env.cubes[0])  # doctest: +SKIP
-    """

@@ -366,14 +366,3 @@ def tally(places: Sequence[float], left: Callable[[], int], colour: str = "yello
         return lambda: on_table((TALLY_X, y)) if i < left() else None
 
     return [Cue(colour, lie(i, y), TALLY_RADIUS) for i, y in enumerate(places)]
-
-
-def build_cue(env: "Stage", name: str, cue: Cue) -> Disc:
-    """A cue's disc, waiting below the table."""
-    return build_highlight(env, name, cue.radius, CUE_HALF_LENGTH, CUE_COLOURS[cue.colour])
-
-
-def show_cue(disc: Disc, cue: Cue) -> None:
-    """Move a disc to where its cue is now."""
-    place = cue.place()
-    disc.move_to(sapien.Pose(BELOW_TABLE if place is None else place, disc.pose.q))

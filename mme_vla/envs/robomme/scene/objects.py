@@ -153,12 +153,11 @@ APERTURE_COLOUR: RGB = tuple((np.array([0xFF, 0xD2, 0x89]) / 255) ** 2.2)
 
 
 class Cube(Thing):
-    """A cube of one colour, which is a name or RGB; `half_size` is half its edge."""
+    """A cube of one colour, which is a name or RGB."""
 
-    def __init__(self, name: str, entity: Any, colour: str | RGB, half_size: float = H) -> None:
+    def __init__(self, name: str, entity: Any, colour: str | RGB) -> None:
         super().__init__(name, entity)
         self.colour = colour
-        self.half_size = half_size
 
 
 class Disc(Thing):
@@ -212,7 +211,7 @@ def build_cube(
     """A cube lying on the table."""
     rgb = COLOURS[colour] if isinstance(colour, str) else colour
     actor = Shapes(env).solid_box([half_size] * 3, rgb).build(name, cube_pose(xy, yaw, half_size))
-    return Cube(name, actor, colour, half_size)
+    return Cube(name, actor, colour)
 
 
 def build_hidden_cube(env: "Stage", name: str, colour: str, xy: XY) -> Cube:
