@@ -21,6 +21,7 @@ from mme_vla.envs.rows import (
     check_row,
     is_row_split,
     rows_of,
+    task_options,
 )
 from mme_vla.errors import UserError, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
@@ -200,10 +201,7 @@ class EpisodeSpec:
         """Keyword arguments of the task that make this episode's scene."""
         options: TaskOptions = {"seed": self.seed, "difficulty": self.difficulty}
         if self.row is not None:
-            options["difficulty"] = self.row.get("difficulty", HARD)
-            options["row"] = self.row
-            options["recovery"] = self.row.get("recovery")
-            options["in_view"] = bool(self.row.get("in_view"))
+            options = task_options(self.row)
         variant = read_variant(self.split)
         if variant is not None:
             options |= variant.options

@@ -150,3 +150,14 @@ class TaskOptions(TypedDict, total=False):
     row: Mapping[str, Any]
     in_view: bool
     stress: Mapping[str, int]
+
+
+def task_options(row: Mapping[str, Any]) -> TaskOptions:
+    """The scene that a row describes."""
+    return {
+        "seed": row["seed"],
+        "difficulty": row.get("difficulty", "hard"),
+        "row": row,
+        "recovery": row.get("recovery"),
+        "in_view": bool(row.get("in_view")),
+    }

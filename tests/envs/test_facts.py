@@ -135,7 +135,7 @@ def _moving(kind: str, motions: Any) -> set[str]:
 
 
 def _unmask(task: Any, ended: Mapping[int, Any]) -> set[str]:
-    return _moving("cover", [task.cover])
+    return _moving("cover", task.visible_motions)
 
 
 def _unmask_swap(task: Any, ended: Mapping[int, Any]) -> set[str]:

@@ -76,42 +76,6 @@ def add_container(
     return env.add(build_container(env, name, (x, y), yaw))
 
 
-class OuterContainers:
-    """Containers that stand around the inner ones and belong to none of the task's lists; some hide
-    a cube.
-
-    The row has them as `objects.distractors`, or `objects.distractors.public` where they change
-    places.
-    """
-
-    def __init__(self, env: Task) -> None:
-        self.containers: list[Container] = []
-        self.hidden: list[tuple[Cube, Container]] = []
-        values = env.values
-        part = "objects.distractors"
-        if values.find(f"{part}.public") is not None:
-            part = f"{part}.public"
-        table = Region((0, 0), WIDER_HALF)  # without effect: the row has their places
-        for i in range(values.count(f"{part}.bins")):
-            name = f"distractor_bin_{i}"
-            container = add_container(env, env.draws, name, f"{part}.bins.{i}", table, [], H)
-            self.containers.append(container)
-        if not self.containers:
-            return
-        indices = values.indices(f"{part}.cube_bins", list, len(self.containers))
-        colours = values.words(f"{part}.cube_colors", list, COLOURS)
-        values.require(
-            len(colours) == len(indices),
-            f"{part}.cube_colors",
-            f"has {len(colours)} colours for {len(indices)} cubes",
-        )
-        for j, (i, colour) in enumerate(zip(indices, colours, strict=True)):
-            container = self.containers[i]
-            name = f"distractor_cube_{j}_{colour}"
-            cube = env.add(build_hidden_cube(env, name, colour, container.position[:2]))
-            self.hidden.append((cube, container))
-
-
 class ContainerTask(Task):
     """Cubes under some of the containers, of which one or two are to be found."""
 
@@ -119,7 +83,8 @@ class ContainerTask(Task):
     """Options of multi-choice: picking a container up, and putting it down."""
     pick_count: int
     containers: list[Container]
-    outer: OuterContainers
+    visible_motions: Sequence[Cover | Swap]
+    """Set by `start_episode`: those that show what is to be remembered."""
     colours: list[str]
     over_cubes: list[Container]
     """The container over the cube of each colour."""
@@ -132,6 +97,41 @@ class ContainerTask(Task):
             "layout.bins",
             f"has {count} containers; expected at least {MOST_PICKS}",
         )
+
+    def add_outer_containers(self, draws: Draws) -> None:
+        """Add the containers that stand around the inner ones and belong to none of their lists;
+        some hide a cube.
+
+        The row has them as `objects.distractors`, or `objects.distractors.public` where they change
+        places.
+        """
+        self.outer: list[Container] = []
+        self.outer_hidden: list[tuple[Cube, Container]] = []
+        values = self.values
+        part = "objects.distractors"
+        if values.find(f"{part}.public") is not None:
+            part = f"{part}.public"
+        table = Region((0, 0), WIDER_HALF)  # without effect: the row has their places
+        for i in range(values.count(f"{part}.bins")):
+            name = f"distractor_bin_{i}"
+            self.outer.append(add_container(self, draws, name, f"{part}.bins.{i}", table, [], H))
+        if not self.outer:
+            return
+        indices = values.indices(f"{part}.cube_bins", list, len(self.outer))
+        colours = values.words(f"{part}.cube_colors", list, COLOURS)
+        values.require(
+            len(colours) == len(indices),
+            f"{part}.cube_colors",
+            f"has {len(colours)} colours for {len(indices)} cubes",
+        )
+        for j, (i, colour) in enumerate(zip(indices, colours, strict=True)):
+            container = self.outer[i]
+            name = f"distractor_cube_{j}_{colour}"
+            cube = self.add(build_hidden_cube(self, name, colour, container.position[:2]))
+            self.outer_hidden.append((cube, container))
+
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
+        return active_motions(self.visible_motions)
 
     def hide_cubes(self) -> list[Cube]:
         """Put a small cube of each colour under its container."""
@@ -195,7 +195,7 @@ class ContainerTask(Task):
 
     def _another_lifted(self, container: Container) -> bool:
         """Whether a wrong one is up, of the inner ones or of those around them."""
-        for other in (*self.containers, *self.outer.containers):
+        for other in (*self.containers, *self.outer):
             if other is not container and container_picked_up(other):
                 return True
         return False
@@ -246,7 +246,7 @@ class Unmask(ContainerTask):
         self.hide_cubes()
         more = self.turned("containers")
         self._add_containers(draws, "layout.empty_bins", more, avoid, WIDER_HALF, gap=H)
-        self.outer = OuterContainers(self)
+        self.add_outer_containers(draws)
 
     def _add_containers(
         self, draws: Draws, part: str, count: int, avoid: Sequence[Avoid], half: float, gap: float
@@ -267,18 +267,15 @@ class Unmask(ContainerTask):
                 return
             self.containers.append(container)
 
-    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
-        return active_motions([self.cover])
-
     def flip_fact(self) -> dict[str, Any]:
         """The first two containers change places, and their cubes with them."""
         first, second, *others = self.values.find("layout.bins")
         return self.values.changed({"layout.bins": [second, first, *others]})
 
     def start_episode(self, draws: Draws) -> None:
-        self.cover = Cover(self.containers, self.parking_group("inner"), self.contents)
-        outer = Cover(self.outer.containers, self.parking_group("outer"))
-        self.motions = [self.cover, outer]
+        cover = Cover(self.containers, self.parking_group("inner"), self.contents)
+        self.visible_motions = [cover]
+        self.motions = [cover, Cover(self.outer, self.parking_group("outer"))]
 
 
 CONTAINERS = {"easy": 3, "medium": 4, "hard": 4}
@@ -335,8 +332,8 @@ class UnmaskSwap(ContainerTask):
             self, self.containers, lambda: self._draw_initiators(draws, count), distinct=False
         )
         self.swap_count = len(self.swapped)
-        self.outer = OuterContainers(self)
-        outer = self.outer.containers
+        self.add_outer_containers(draws)
+        outer = self.outer
         name = "actions.distractor_swap_pairs"
         self.outer_swapped = [(outer[a], outer[b]) for a, b in values.pairs(name, len(outer)) or []]
         swaps = len(self.outer_swapped)
@@ -364,21 +361,18 @@ class UnmaskSwap(ContainerTask):
         """The step at which the last swap ends."""
         return COVER_STEPS + self.swap_steps * self.swap_count
 
-    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
-        return active_motions(self.visible_motions)
-
     def start_episode(self, draws: Draws) -> None:
-        inner, outer = self.containers, self.outer.containers
+        inner, outer = self.containers, self.outer
         start, steps, end = COVER_STEPS, self.swap_steps, self.swapped_after
         swaps = consecutive_swaps(self.swapped, inner, start, steps)
         cover = Cover(inner, self.parking_group("inner"), self.contents)
         pairs = list(zip(self.cubes, self.over_cubes, strict=True))
-        self.visible_motions: list[Cover | Swap] = [cover, *swaps]
+        self.visible_motions = [cover, *swaps]
         self.motions = [
             cover,
             Cover(outer, self.parking_group("outer")),
             *swaps,
             *consecutive_swaps(self.outer_swapped, outer, start, steps),
             Hide(pairs, start, end, self.parking_group("inner cubes")),
-            Hide(self.outer.hidden, start, end, self.parking_group("outer cubes")),
+            Hide(self.outer_hidden, start, end, self.parking_group("outer cubes")),
         ]

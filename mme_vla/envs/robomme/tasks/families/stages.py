@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 
@@ -234,17 +234,10 @@ def delay(env: Task) -> int:
 # Sub-tasks ----------------------------------------------------------------------------------------
 
 
-class Details(TypedDict, total=False):
-    """Fields of `SubTask` that the sub-tasks below leave to the task."""
-
-    grounded: str
-    failed: Callable[[], bool]
-    video: bool
-    pick: bool
-    operation: str | Callable[[], str]
+# `details` are further fields of `SubTask`.
 
 
-def press(button: Button, text: str, choice: str, **details: Unpack[Details]) -> SubTask:
+def press(button: Button, text: str, choice: str, **details: Any) -> SubTask:
     """Press a button; the pixel stands behind the word `button`."""
     details.setdefault("grounded", text.replace("button", "button at <>", 1))
     return SubTask(
@@ -257,9 +250,7 @@ def press(button: Button, text: str, choice: str, **details: Unpack[Details]) ->
     )
 
 
-def pick(
-    env: Task, cube: Cube, text: str, choice: str = "a", **details: Unpack[Details]
-) -> SubTask:
+def pick(env: Task, cube: Cube, text: str, choice: str = "a", **details: Any) -> SubTask:
     """Pick up a cube; the pixel stands behind the word `cube`."""
     details.setdefault("grounded", text.replace("cube", "cube at <>", 1))
     return SubTask(
@@ -278,7 +269,7 @@ def put_down(
     text: str,
     choice: str,
     z: float = RELEASE_Z,
-    **details: Unpack[Details],
+    **details: Any,
 ) -> SubTask:
     """Put the held cube down where it is, the tool at height `z` in metres."""
     return SubTask(
@@ -297,7 +288,7 @@ def place(
     target: Thing,
     text: str,
     choice: str = "b",
-    **details: Unpack[Details],
+    **details: Any,
 ) -> SubTask:
     """Place the held cube onto a target; the pixel stands behind the word `target`."""
     details.setdefault("grounded", text.replace("target", "target at <>", 1))
