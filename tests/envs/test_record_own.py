@@ -109,3 +109,60 @@ def test_an_episode_without_options_does_not_get_those_of_another(tmp_path: Path
     records = read_json(tmp_path / "data" / "meta" / "robomme_episodes.json", "records")["episodes"]
     assert [record["options"] for record in records] == [[], [option]]
     assert [record["episode_index"] for record in records] == [0, 1]
+
+
+def _record_blink(monkeypatch: pytest.MonkeyPatch, output: Path, observe: Any) -> None:
+    """Record two episodes of examples/blink whose observations a function changes."""
+    monkeypatch.syspath_prepend(REPOSITORY / "examples" / "blink")
+    import_plugins(["blink"])
+    kind = type(environment("blink"))
+    make = kind.make
+
+    def changed(self: Any, spec: EpisodeSpec, render: bool = True) -> Any:
+        env = make(self, spec, render)
+        given = env.observe
+        env.observe = lambda light=False: observe(spec.episode, env.time, given(light))
+        return env
+
+    monkeypatch.setattr(kind, "make", changed)
+    words = {"env": "blink", "tasks": "all", "task": None, "split": "train", "fps": 20}
+    record_environment(OmegaConf.create({**words, "output": str(output), "episodes": 2}))
+
+
+def _second_camera(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
+    return given | {"wrist": given["top"]} if episode else given
+
+
+def _larger_image(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
+    return {**given, "top": np.zeros((64 + episode, 64, 3), np.uint8)}
+
+
+def _growing_image(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
+    return {**given, "top": np.zeros((64 + (time > 1), 64, 3), np.uint8)}
+
+
+def _other_camera(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
+    return {"side": given["top"], "state": given["state"]}
+
+
+def _wider_state(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
+    return {**given, "state": np.zeros(2, np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("observe", "words"),
+    [
+        (_second_camera, r"Blink, episode 1: a frame has .*images\.wrist.* as in the episodes bef"),
+        (_larger_image, r"Blink, episode 1: a frame has .*images\.top \[65, 64, 3\]"),
+        (_growing_image, r"Blink, episode 0: observation\.images\.top of frame 6 has the shape"),
+        (_other_camera, r"images\.side .* embodiment names the cameras top, 1 numbers of state"),
+        (_wider_state, r"state \[2\], and embodiment names the cameras top, 1 numbers of state"),
+    ],
+)
+def test_a_recording_refuses_frames_of_another_form_and_can_be_resumed(
+    observe: Any, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with monkeypatch.context() as changes, pytest.raises(UserError, match=words):
+        _record_blink(changes, tmp_path / "data", observe)
+    _record_blink(monkeypatch, tmp_path / "data", lambda episode, time, given: given)
+    assert read_json(tmp_path / "data" / "meta" / "info.json", "a dataset")["total_episodes"] == 2

@@ -3,7 +3,7 @@
 import json
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from mme_vla.envs.base import CHOICES, OPTIONS, Environment, EpisodeEnv
 from mme_vla.envs.facts import Fact, read_facts, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.errors import UserError, counted
+from mme_vla.errors import UserError, counted, require
 from mme_vla.utils import parse_json, write_atomically, write_json
 
 STATE = "observation.state"
@@ -53,34 +53,45 @@ def record_own(
         Frames, and the episodes that did not succeed.
     """
     draft = work / DRAFT
-    episodes = {work / episode_file(spec): spec for spec in specs}
     shutil.rmtree(draft, ignore_errors=True)
     dataset: Any = None
+    shapes: dict[str, list[int]] = {}  # of a frame's columns, the same in all episodes
+    tables: list[tuple[int, str, list[Fact]]] = []
+    records: list[dict[str, Any]] = []
     failures = []
     frames = 0
     with quiet_libraries(), progress("record", len(specs), unit="episodes") as advance:
-        for path, spec in episodes.items():
-            if not path.is_file():
+        for spec in specs:
+            path = work / episode_file(spec)
+            is_kept = path.is_file()
+            columns: dict[str, np.ndarray] | None
+            if is_kept:
+                with np.load(path) as loaded:
+                    columns = dict(loaded)
+            else:
                 columns = _demonstrated(environment, spec)
-                if columns is None:
-                    failures.append(spec)
-                else:
-                    with write_atomically(path) as temporary, temporary.open("wb") as file:
-                        np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             advance(1)
-        tables: list[tuple[int, str, list[Fact]]] = []
-        records: list[dict[str, Any]] = []
-        for path in filter(Path.is_file, episodes):
-            with np.load(path) as loaded:
-                columns = dict(loaded)
+            if columns is None:
+                failures.append(spec)
+                continue
+            of_frame = _shapes(columns)
+            shapes = shapes or of_frame
+            require(
+                of_frame == shapes,
+                f"{spec.task}, episode {spec.episode}: a frame has {_in_words(of_frame)}; expected"
+                f" {_in_words(shapes)}, as in the episodes before. Give the same cameras and sizes"
+                " in every episode.",
+            )
+            if not is_kept:
+                with write_atomically(path) as temporary, temporary.open("wb") as file:
+                    np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             goal = str(columns.pop("task"))
             # An earlier version kept no facts.
             facts = parse_json(str(columns.pop("facts", "[]")), str(path), list)
             options = parse_json(str(columns.pop("options", "[]")), str(path), list)
-            task = episodes[path].task
             # Of every episode, also of one without options: a reader counts them.
-            records.append({"episode_index": len(tables), "task": task, "options": options})
-            tables.append((len(tables), task, read_facts(facts, str(path))))
+            records.append({"episode_index": len(tables), "task": spec.task, "options": options})
+            tables.append((len(tables), spec.task, read_facts(facts, str(path))))
             length = len(columns[STATE])
             for frame in range(length):
                 row = {name: column[frame] for name, column in columns.items()}
@@ -104,6 +115,15 @@ def record_own(
     return frames, failures
 
 
+def _shapes(columns: Mapping[str, np.ndarray]) -> dict[str, list[int]]:
+    """What one frame has of each column: the sizes of its array."""
+    return {name: list(column.shape[1:]) for name, column in columns.items() if column.ndim}
+
+
+def _in_words(shapes: Mapping[str, Sequence[int]]) -> str:
+    return ", ".join(f"{name} {shape}" for name, shape in sorted(shapes.items()))
+
+
 def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.ndarray] | None:
     """The columns of an episode [frames, …], its `task`, `facts` and `options`; None where it did
     not succeed.
@@ -120,6 +140,15 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
         else:
             columns = _by_motions(env)
             success = env.success
+            if robot is not None:
+                cameras = {f"{IMAGES}{camera}" for camera in robot.camera_names}
+                widths = (columns[STATE].shape[-1], columns[ACTION].shape[-1])
+                require(
+                    cameras <= set(columns) and widths == (robot.state.width, robot.action.width),
+                    f"{spec.task}: a frame has {_in_words(_shapes(columns))}, and embodiment names"
+                    f" the cameras {', '.join(robot.camera_names)}, {robot.state.width} numbers of"
+                    f" state and {robot.action.width} of an action. Correct one of the two.",
+                )
         if not success:
             return None
         columns["task"] = np.array(env.goal)
@@ -140,6 +169,13 @@ def _by_motions(env: EpisodeEnv) -> dict[str, np.ndarray]:
         row[ACTION] = np.asarray(action, np.float32)
         row[IS_DEMO] = np.array([visible])
         rows.append(row)
+        for name, value in row.items():
+            if value.shape != rows[0][name].shape:
+                raise UserError(
+                    f"{env.spec.task}, episode {env.spec.episode}: {name} of frame {len(rows) - 1}"
+                    f" has the shape {list(value.shape)}, and of frame 0"
+                    f" {list(rows[0][name].shape)}. Give the same sizes in every frame."
+                )
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
