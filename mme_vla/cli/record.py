@@ -179,7 +179,7 @@ def report_coverage(
             advance(1)
     official = [place for place in plan.places if place != plan.dataset]
     coverage = compare(goals_recorded(plan.dataset, official), zip(specs, goals, strict=True))
-    write_json(file, {task: of_task.to_dict() for task, of_task in coverage.items()}, indent=1)
+    write_json(file, coverage, indent=1)
     print(f"{in_words(coverage)}\n{file}")
 
 

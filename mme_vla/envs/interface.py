@@ -33,9 +33,9 @@ from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 from mme_vla.envs.robomme.robot.control import PlanningError
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
-from mme_vla.envs.spaces import UnreachableError, action_space
+from mme_vla.envs.spaces import SPACES, UnreachableError
 from mme_vla.envs.subtasks import NO_RECORD
-from mme_vla.errors import UserError, listed, require
+from mme_vla.errors import UserError, check_known, listed, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
@@ -139,7 +139,8 @@ class RoboMMEEnv(gymnasium.Env):
     ) -> None:
         is_count = type(max_steps) is int and max_steps >= 1
         require(is_count, f"max_steps is {max_steps!r}; expected a positive integer.")
-        self._space = action_space(action)
+        check_known("action space", action, SPACES)
+        self._space = SPACES[action]
         self._total_reward = REWARDS[reward]
         self.include = include or Include()
         self.max_steps = max_steps

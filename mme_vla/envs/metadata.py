@@ -273,8 +273,7 @@ def episodes(task: str, split: str = "test") -> list[EpisodeSpec]:
             task in TASK_NAMES,
             f"split={CHALLENGE} has the benchmark's tasks alone, and {task} is none.",
         )
-        return list(_table(split)[task])
-    if task not in TASK_NAMES or split not in SPLITS:
+    elif task not in TASK_NAMES or split not in SPLITS:
         return [
             EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])
         ]

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from mme_vla.embodiment.robomme import ARM_JOINTS, POSE, SIDE
 from mme_vla.envs.grounding import project
 from mme_vla.envs.robomme.robot.control import GRIPPER_STEPS
-from mme_vla.errors import UserError, check_known, did_you_mean, require
+from mme_vla.errors import UserError, did_you_mean, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
@@ -158,12 +158,6 @@ class MultiChoice(ActionSpace):
 SPACES: dict[str, ActionSpace] = {
     space.name: space for space in (JointAngle(), EndEffectorPose(), Waypoint(), MultiChoice())
 }
-
-
-def action_space(name: str) -> ActionSpace:
-    """The action space of that name."""
-    check_known("action space", name, SPACES)
-    return SPACES[name]
 
 
 def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.ndarray:

@@ -111,6 +111,8 @@ class Task(Stage):
             )
             if turned:
                 self.stress[dial] = turned
+        self.where = f"{type(self).__name__}, seed {seed}"
+        """What errors call the scene."""
         self.in_view = in_view
         self.row = row
         """The scene's values, where it is not sampled from its seed."""
@@ -244,8 +246,7 @@ class Task(Stage):
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
         row = self.row or {}
-        where = row.get("where", f"{type(self).__name__}, seed {self.seed}")
-        self.values = Values(row.get("spec"), str(where))
+        self.values = Values(row.get("spec"), str(row.get("where", self.where)))
         self.draws = Draws(self.seed)
         self.plan(self.draws)
         if not self.shared_draws:

@@ -49,7 +49,7 @@ def test_obstacles_are_thin_along_the_row(env):
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 def test_routes_go_to_neighbours_and_may_return_only_where_they_may(env, monkeypatch, difficulty):
-    for name in ("difficulty", "route", "directions"):
+    for name in ("difficulty", "path", "directions"):
         monkeypatch.setattr(env, name, difficulty)
     counts, returns, (moves, may_return) = set(), 0, MOVES[difficulty]
     for seed in range(100):

@@ -12,7 +12,7 @@ sapien = pytest.importorskip(
 )
 
 from mme_vla.envs.grounding import project  # noqa: E402
-from mme_vla.envs.spaces import UnreachableError, action_space  # noqa: E402
+from mme_vla.envs.spaces import SPACES, UnreachableError  # noqa: E402
 from mme_vla.envs.subtasks import Choice  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 
@@ -72,7 +72,7 @@ def test_joints_and_poses_are_one_step(
     name: str, stick: bool, action: list[float], step: list[float]
 ) -> None:
     hand, steps = control(stick)
-    action_space(name).act(hand, action)
+    SPACES[name].act(hand, action)
     np.testing.assert_array_equal(steps, [step])
 
 
@@ -90,7 +90,7 @@ def test_a_waypoint_moves_a_gripper_only_at_exactly_one(
     stick: bool, gripper: float, expected: list[str]
 ) -> None:
     hand, _ = control(stick)
-    action_space("waypoint").act(hand, [*POSE, gripper])
+    SPACES["waypoint"].act(hand, [*POSE, gripper])
     assert hand.done == [[0.1, 0.0, 0.2], *expected]
 
 
@@ -121,7 +121,7 @@ def test_malformed_actions_are_refused_without_a_step(
 ) -> None:
     hand, steps = control(stick)
     with pytest.raises(UserError, match=words):
-        action_space(name).act(hand, action)
+        SPACES[name].act(hand, action)
     assert not steps
     assert not hand.done
 
@@ -129,7 +129,7 @@ def test_malformed_actions_are_refused_without_a_step(
 def test_an_unreachable_pose_says_so() -> None:
     hand, steps = control(reachable=False)
     with pytest.raises(UnreachableError, match="IK failed"):
-        action_space("ee_pose").act(hand, [*POSE, 1.0])
+        SPACES["ee_pose"].act(hand, [*POSE, 1.0])
     assert not steps
 
 
@@ -138,22 +138,20 @@ def test_an_unreachable_pose_says_so() -> None:
 def test_a_choice_takes_the_object_nearest_to_the_point(index: int, label: str) -> None:
     hand, _ = control()
     expected = hand.env.cubes[index]
-    action_space("multi_choice").act(
-        hand, {"choice": label, "point": project(expected.position) + 3}
-    )
+    SPACES["multi_choice"].act(hand, {"choice": label, "point": project(expected.position) + 3})
     assert hand.done == [expected]
 
 
 def test_a_choice_without_an_object_needs_no_point() -> None:
     hand, _ = control()
-    action_space("multi_choice").act(hand, {"choice": "B", "point": []})
+    SPACES["multi_choice"].act(hand, {"choice": "B", "point": []})
     assert hand.done == ["pressed"]
 
 
 def test_an_unknown_choice_takes_no_step_and_warns() -> None:
     hand, steps = control()
     with pytest.warns(UserWarning, match="Unknown choice 'Z'.*Known: a, b"):
-        action_space("multi_choice").act(hand, {"choice": "Z"})
+        SPACES["multi_choice"].act(hand, {"choice": "Z"})
     assert not steps
     assert not hand.done
 
@@ -162,5 +160,5 @@ def test_an_unknown_choice_takes_no_step_and_warns() -> None:
 @pytest.mark.parametrize("name", ["joint_angle", "ee_pose", "waypoint"])
 def test_sampled_actions_have_the_size_of_the_space(name: str, stick: bool) -> None:
     hand, steps = control(stick)
-    action_space(name).act(hand, action_space(name).space(stick).sample())
+    SPACES[name].act(hand, SPACES[name].space(stick).sample())
     assert len(steps) + len(hand.done) >= 1

@@ -43,7 +43,7 @@ def test_goals_without_a_demonstration_are_named_with_their_episodes() -> None:
     specs = [EpisodeSpec("StopCube", "test", i, i, "easy") for i in range(4)]
     requests = list(zip(specs, ["third", "second", "third", "fifth"], strict=True))
     result = coverage.compare({"StopCube": {"second"}, "BinFill": {"third"}}, requests)["StopCube"]
-    assert result.to_dict() == {
+    assert result == {
         "goals": 3, "goals_covered": 1, "episodes": 4, "episodes_covered": 1,
         "missing": {"third": [0, 2], "fifth": [3]},
     }  # fmt: skip
@@ -53,7 +53,7 @@ def test_goals_without_a_demonstration_are_named_with_their_episodes() -> None:
         "  never shown: fifth (episode 3)",
     ]
     result = coverage.compare({"StopCube": {"second", "third", "fifth"}}, requests)["StopCube"]
-    assert result.to_dict()["missing"] == {}
+    assert result["missing"] == {}
 
 
 def test_a_goal_is_what_the_scene_says() -> None:

@@ -384,11 +384,6 @@ def make_vec_env(
         env == ROBOMME or (reward == "none" and include is None),
         f"env={env} takes no reward and no include: they are for env={ROBOMME}.",
     )
-    if env == ROBOMME:
-        check_known("action space", action_space, ACTION_SPACES)
-        check_known("reward", reward, REWARDS)
-    specs = choose_episodes(tasks, episodes, split, env)
-    jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     shared: dict[str, Any] = {
         "action_space": action_space,
         "max_steps": max_steps,
@@ -396,5 +391,9 @@ def make_vec_env(
     }
     make = partial(open_episode, env, **shared)
     if env == ROBOMME:
+        check_known("action space", action_space, ACTION_SPACES)
+        check_known("reward", reward, REWARDS)
         make = partial(make_env, **shared, reward=reward, include=include)
+    specs = choose_episodes(tasks, episodes, split, env)
+    jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     return VecEnv(jobs, workers, make, timeout)

@@ -4,7 +4,6 @@ never do.
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,47 +40,40 @@ def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, 
     return goals
 
 
-@dataclass
-class TaskCoverage:
-    """Of one task: the numbers of the episodes with each goal, and which goals were recorded."""
-
-    recorded: set[str]
-    goals: dict[str, list[int]] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, fit for JSON."""
-        missing = {goal: i for goal, i in self.goals.items() if goal not in self.recorded}
-        episodes = sum(map(len, self.goals.values()))
-        return {
-            "goals": len(self.goals),
-            "goals_covered": len(self.goals) - len(missing),
-            "episodes": episodes,
-            "episodes_covered": episodes - sum(map(len, missing.values())),
-            "missing": missing,
-        }
-
-
 def compare(
     recorded: Mapping[str, set[str]], requested: Iterable[tuple[EpisodeSpec, str]]
-) -> dict[str, TaskCoverage]:
-    """Which of the goals of episodes were recorded, by task.
+) -> dict[str, dict[str, Any]]:
+    """Which of the goals of episodes were recorded, by task: plain values, fit for JSON.
 
     Args:
         recorded: goals by task.
         requested: episodes with their goals.
+
+    Returns:
+        Of each task the numbers of goals and of episodes, how many of them are covered, and the
+        missing goals, each with the numbers of its episodes.
     """
-    coverage: dict[str, TaskCoverage] = {}
+    numbers: dict[str, dict[str, list[int]]] = {}
     for spec, goal in requested:
-        task = coverage.setdefault(spec.task, TaskCoverage(recorded.get(spec.task, set())))
-        task.goals.setdefault(goal, []).append(spec.episode)
+        numbers.setdefault(spec.task, {}).setdefault(goal, []).append(spec.episode)
+    coverage = {}
+    for task, goals in numbers.items():
+        missing = {goal: i for goal, i in goals.items() if goal not in recorded.get(task, ())}
+        episodes = sum(map(len, goals.values()))
+        coverage[task] = {
+            "goals": len(goals),
+            "goals_covered": len(goals) - len(missing),
+            "episodes": episodes,
+            "episodes_covered": episodes - sum(map(len, missing.values())),
+            "missing": missing,
+        }
     return coverage
 
 
-def in_words(coverage: Mapping[str, TaskCoverage]) -> str:
+def in_words(coverage: Mapping[str, Mapping[str, Any]]) -> str:
     """A line a task, and the missing goals of the split `test` under it."""
     lines = []
-    for name, task in coverage.items():
-        counts = task.to_dict()
+    for name, counts in coverage.items():
         lines.append(
             f"{name}: {counts['goals_covered']} of {counts['goals']} goals of 'test',"
             f" {counts['episodes_covered']} of {counts['episodes']} episodes"

@@ -202,16 +202,21 @@ def draw_cube(
     region: Region,
     avoid: Sequence[Avoid] = (),
     gap: float = 0.005,
-) -> tuple[np.ndarray, float] | None:
+    what: str = "A cube",
+) -> tuple[np.ndarray, float]:
     """Sample the position and the yaw of a cube; targets are no obstacles.
 
     Args:
         region: the cube keeps inside it, as if it were not turned.
         avoid: what it keeps clear of.
         gap: metres.
+        what: names the cube in the error.
 
     Returns:
-        Centre [2] and yaw in radians; None when 256 trials have failed.
+        Centre [2] and yaw in radians.
+
+    Raises:
+        SceneError: 256 trials have failed.
     """
     obstacles = _obstacles(avoid)
     for _ in range(TRIALS):
@@ -220,19 +225,28 @@ def draw_cube(
         cube = Box2D.square(xy, H + gap, angle)
         if not any(cube.intersects(obstacle) for obstacle in obstacles):
             return xy, angle
-    return None
+    raise SceneError(f"{what} finds no place.")
 
 
 def draw_disc(
-    draws: Draws, region: Region, radius: float, avoid: Sequence[Avoid] = (), gap: float = 0.005
-) -> np.ndarray | None:
-    """Sample the centre of a target [2]; None when 256 trials have failed.
+    draws: Draws,
+    region: Region,
+    radius: float,
+    avoid: Sequence[Avoid] = (),
+    gap: float = 0.005,
+    what: str = "A target",
+) -> np.ndarray:
+    """Sample the centre of a target [2].
 
     Args:
         region: the target lies wholly inside it.
         radius: metres.
         avoid: what it keeps clear of; other targets are circles.
         gap: metres.
+        what: names the target in the error.
+
+    Raises:
+        SceneError: 256 trials have failed.
     """
     circles = [(disc.position[:2], disc.radius) for disc in avoid if isinstance(disc, Disc)]
     obstacles = _obstacles(avoid)
@@ -241,12 +255,16 @@ def draw_disc(
         clear = all(obstacle.distance(xy) >= radius + gap for obstacle in obstacles)
         if clear and all(_length(xy - centre) >= radius + gap + other for centre, other in circles):
             return xy
-    return None
+    raise SceneError(f"{what} finds no place.")
 
 
 def draw_container(
-    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005
-) -> tuple[np.ndarray, float] | None:
+    draws: Draws,
+    region: Region,
+    avoid: Sequence[Avoid] = (),
+    gap: float = 0.005,
+    what: str = "A container",
+) -> tuple[np.ndarray, float]:
     """Sample the position of a container and then its yaw, 0 … 90°; the gap to other objects counts
     twice.
 
@@ -254,16 +272,20 @@ def draw_container(
         region: the container lies inside it.
         avoid: what it keeps clear of.
         gap: metres.
+        what: names the container in the error.
 
     Returns:
-        Centre [2] and yaw in degrees, as rows have it; None when 256 trials have failed.
+        Centre [2] and yaw in degrees, as rows have it.
+
+    Raises:
+        SceneError: 256 trials have failed.
     """
     obstacles = _obstacles(avoid, grow=gap)
     for _ in range(TRIALS):
         xy = region.place(draws, CONTAINER_HALF)
         if all(obstacle.distance(xy) >= CONTAINER_HALF + gap for obstacle in obstacles):
             return xy, 90 * draws.uniform()
-    return None
+    raise SceneError(f"{what} finds no place.")
 
 
 def draw_button(

@@ -157,8 +157,10 @@ class Values:
         )
         return list(value)
 
-    def count(self, name: str) -> int:
-        """Entries of a list of the row; 0 where it has none."""
+    def count(self, name: str, sampled: int = 0) -> int:
+        """Entries of a list of the row, 0 where it has none; `sampled` where there is no row."""
+        if not self.specified:
+            return sampled
         return len(self.read(name, list) or [])
 
     def note(self, name: str, value: Any) -> None:

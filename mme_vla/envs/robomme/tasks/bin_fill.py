@@ -83,7 +83,7 @@ class BinFill(Task):
             if len(self.cubes[colour]) < self.goal[colour]:
                 problem = f"a {colour} cube for the bin"
                 values.require(not values.specified, "objects.slot_assignment", f"lacks {problem}")
-                raise SceneError(f"BinFill, seed {self.seed}: {problem} finds no place.")
+                raise SceneError(f"{self.where}: {problem} finds no place.")
 
     def _draw_counts(self, draws: Draws) -> list[int]:
         """How many red, blue and green cubes belong into the bin; also samples how many lie on the

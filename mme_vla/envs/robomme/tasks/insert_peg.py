@@ -68,11 +68,8 @@ class InsertPeg(Task):
         tail = (1 - head[0], 1 - head[1], 1 - head[2])
         draws.integer(0, 3)  # likewise
         self.box = self.add(build_aperture_box(self, (0, 0), math.pi / 2))
-        count = PEGS
-        if self.values.specified:
-            count = self.values.count("initializations.pegs")
         self.pegs: list[Peg] = []
-        for i in range(count):
+        for i in range(self.values.count("initializations.pegs", PEGS)):
             xy = (0.2, 0.2 * (i - 1))
             peg = build_peg(self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, xy, 0)
             self.pegs.append(self.add(peg))
@@ -129,7 +126,7 @@ class InsertPeg(Task):
             clear = all(math.dist(place, other) > FROM_PEG for other in others)
             if clear and math.dist(place, box) > FROM_BOX:
                 return place
-        raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
+        raise SceneError(f"{self.where}: a peg finds no place.")
 
     def flip_fact(self) -> dict[str, Any] | None:
         """The first two pegs, of which the video takes one, change places."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import sapien
 
 from mme_vla.envs.facts import Candidates
@@ -62,8 +61,12 @@ class MoveCube(Task):
         peg = self._place_peg(draws, "execution")
         for _ in range(2):
             draws.integer(0, 2)
-        video_goal = self.values.place("layout.demo.goal_xy", lambda: self._draw_goal(draws, 0.15))
-        goal = self.values.place("layout.execution.goal_xy", lambda: self._draw_goal(draws, 0.1))
+        video_goal = self.values.place(
+            "layout.demo.goal_xy", lambda: draw_disc(draws, Region((0, 0), 0.15), TARGET_RADIUS)
+        )
+        goal = self.values.place(
+            "layout.execution.goal_xy", lambda: draw_disc(draws, Region((0, 0), 0.1), TARGET_RADIUS)
+        )
         x, y, yaw = video_peg
         self.peg = self.add(
             build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, (x, y), yaw)
@@ -94,11 +97,6 @@ class MoveCube(Task):
         values.note(f"layout.{part}.peg_yaw", yaw)
         return x, y, yaw
 
-    def _draw_goal(self, draws: Draws, half: float) -> np.ndarray:
-        xy = draw_disc(draws, Region((0, 0), half), TARGET_RADIUS, [], gap=0)
-        assert xy is not None
-        return xy
-
     def _place_cube(
         self, draws: Draws, part: str, goal: Sequence[float], avoid: Sequence[Avoid]
     ) -> list[float]:
@@ -116,13 +114,10 @@ class MoveCube(Task):
         for _ in range(TRIES):
             centre = (-0.1 + 0.2 * draws.uniform(), -0.1 + 0.2 * draws.uniform())
             if math.dist(centre, goal) > CUBE_FROM_TARGET:
-                place = draw_cube(draws, Region(centre, 0.05), avoid, gap=CUBE_GAP)
-                if place is not None:
-                    return [*place[0], place[1]]
-                break
-        raise SceneError(
-            f"MoveCube, seed {self.seed}: the cube finds no place away from the target."
-        )
+                what = f"{self.where}: the cube"
+                xy, yaw = draw_cube(draws, Region(centre, 0.05), avoid, CUBE_GAP, what)
+                return [*xy, yaw]
+        raise SceneError(f"{self.where}: the cube finds no place away from the target.")
 
     def start_episode(self, draws: Draws) -> None:
         self.manner = MANNERS[

@@ -70,9 +70,7 @@ class PatternLock(StickTask):
             path = search(draws, n, start, goal, {start})
             if path is not None and low <= len(path) <= high:
                 return path
-        raise SceneError(
-            f"PatternLock, seed {self.seed}: no path of {low} to {high} discs in {TRIES} tries."
-        )
+        raise SceneError(f"{self.where}: no path of {low} to {high} discs in {TRIES} tries.")
 
     def flip_fact(self) -> dict[str, Any] | None:
         """Another path of the same length from the same disc, with another first move; None where

@@ -57,9 +57,7 @@ class PickHighlight(Task):
         self.other_cubes = [cube for cube in self.cubes if cube not in self.goal_cubes]
 
     def _add_cubes(self, draws: Draws, name: str, part: str, count: int) -> None:
-        if self.values.specified:
-            count = self.values.count(part)
-        for i in range(count):
+        for i in range(self.values.count(part, count)):
             colour = self._colour(draws, len(self.cubes))
             cube = add_cube(
                 self,

@@ -65,10 +65,8 @@ def add_container(
     """
 
     def sample() -> list[float]:
-        place = draw_container(draws, region, avoid, gap=gap)
-        if place is None:
-            raise SceneError(f"{type(env).__name__}, seed {env.seed}: {name} finds no place.")
-        return [*place[0], place[1]]
+        xy, degrees = draw_container(draws, region, avoid, gap, f"{env.where}: {name}")
+        return [*xy, degrees]
 
     x, y, degrees = env.values.place(value, sample, size=3)
     yaw = float(np.deg2rad(degrees))
@@ -233,8 +231,8 @@ class Unmask(ContainerTask):
         """Place the containers, hide the cubes under the first three, and add what a dial or a row
         adds.
         """
-        count = STANDING[self.difficulty]
         self.containers = []
+        count = STANDING[self.difficulty]
         self._add_containers(draws, "layout.bins", count, avoid, STANDING_HALF, gap=2 * H)
         if self.values.specified:
             self.check_count()
@@ -251,12 +249,10 @@ class Unmask(ContainerTask):
     def _add_containers(
         self, draws: Draws, part: str, count: int, avoid: Sequence[Avoid], half: float, gap: float
     ) -> None:
-        """Place containers in the middle of the table until there are `count` more or one finds no
-        place.
+        """Place containers in the middle of the table until there are `count` more, or as many as
+        the row has, or one finds no place.
         """
-        if self.values.specified:
-            count = self.values.count(part)
-        for i in range(count):
+        for i in range(self.values.count(part, count)):
             name = f"container_{len(self.containers)}"
             taken = [*avoid, *self.containers]
             try:
@@ -305,9 +301,7 @@ class UnmaskSwap(ContainerTask):
         """
         values = self.values
         self.containers = []
-        count = len(anchors)
-        if values.specified:
-            count = values.count("layout.bins")
+        count = values.count("layout.bins", len(anchors))
         for i in range(count):
             region = Region(anchors[min(i, len(anchors) - 1)], ANCHOR_HALF)
             taken = [*avoid, *self.containers]

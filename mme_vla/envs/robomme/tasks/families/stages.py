@@ -4,8 +4,6 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.articulated import BUTTON_BASE, Button, build_button
@@ -15,7 +13,6 @@ from mme_vla.envs.robomme.scene.placement import (
     Avoid,
     Draws,
     Region,
-    SceneError,
     draw_button,
     draw_cube,
     draw_disc,
@@ -58,10 +55,8 @@ def add_cube(
     """
 
     def sample() -> list[float]:
-        place = draw_cube(draws, region, avoid, gap=gap)
-        if place is None:
-            raise SceneError(f"{type(env).__name__}, seed {env.seed}: {name} finds no place.")
-        return [*place[0], place[1]]
+        xy, yaw = draw_cube(draws, region, avoid, gap, f"{env.where}: {name}")
+        return [*xy, yaw]
 
     x, y, yaw = env.values.place(value, sample, size=3)
     env.values.occupy(value, (x, y), H, yaw)
@@ -129,14 +124,9 @@ def add_target(
     Raises:
         SceneError: no place is free.
     """
-
-    def sample() -> np.ndarray:
-        xy = draw_disc(draws, region, radius, avoid, gap=gap)
-        if xy is None:
-            raise SceneError(f"{type(env).__name__}, seed {env.seed}: {name} finds no place.")
-        return xy
-
-    xy = env.values.place(value, sample)
+    xy = env.values.place(
+        value, lambda: draw_disc(draws, region, radius, avoid, gap, f"{env.where}: {name}")
+    )
     return env.add(build_disc(env, name, radius, TARGET_THICKNESS, colour, xy))
 
 

@@ -100,9 +100,7 @@ class VideoPlace(VideoSwaps):
         check_colour(self, self.cube.colour)
 
     def _add_targets(self, draws: Draws, table: Region) -> list[Disc]:
-        count = self.target_counts[self.difficulty]
-        if self.values.specified:
-            count = self.values.count("layout.targets")
+        count = self.values.count("layout.targets", self.target_counts[self.difficulty])
         targets: list[Disc] = []
         for i in range(count):
             avoid: list[Avoid] = [self.spot, self.button, *self.cubes, *targets]
