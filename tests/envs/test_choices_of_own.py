@@ -158,3 +158,16 @@ def test_a_choice_as_an_action_and_back(rails: Environment) -> None:
     action = choice_action(space, {"choice": "C", "point": None})
     assert action.tolist() == [0, 0, 1]
     assert benchmark_action(space, action) == {"choice": "C", "point": []}
+
+
+def test_a_recording_of_choices_needs_every_camera_of_the_robot(
+    rails: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("lerobot", reason="writes a LeRobot dataset: uv sync --extra data")
+    cameras = {"front": {"augment": "none"}, "wrist": {"augment": "none"}}
+    monkeypatch.setattr(Rails, "embodiment", {**Rails.embodiment, "cameras": cameras})
+    words = {"env": "rails", "tasks": "all", "task": None, "split": "train", "episodes": 1}
+    with pytest.raises(UserError, match=r"images\.front .* names the cameras front, wrist, 1 num"):
+        record_environment(
+            OmegaConf.create({**words, "fps": None, "output": str(tmp_path / "data")})
+        )

@@ -154,7 +154,7 @@ def _wider_state(episode: int, time: int, given: dict[str, Any]) -> dict[str, An
     [
         (_second_camera, r"Blink, episode 1: a frame has .*images\.wrist.* as in the episodes bef"),
         (_larger_image, r"Blink, episode 1: a frame has .*images\.top \[65, 64, 3\]"),
-        (_growing_image, r"Blink, episode 0: observation\.images\.top of frame 6 has the shape"),
+        (_growing_image, r"Blink, episode 0: observation\.images\.top has the shapes \(64, "),
         (_other_camera, r"images\.side .* embodiment names the cameras top, 1 numbers of state"),
         (_wider_state, r"state \[2\], and embodiment names the cameras top, 1 numbers of state"),
     ],

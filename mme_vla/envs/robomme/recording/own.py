@@ -140,15 +140,15 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
         else:
             columns = _by_motions(env)
             success = env.success
-            if robot is not None:
-                cameras = {f"{IMAGES}{camera}" for camera in robot.camera_names}
-                widths = (columns[STATE].shape[-1], columns[ACTION].shape[-1])
-                require(
-                    cameras <= set(columns) and widths == (robot.state.width, robot.action.width),
-                    f"{spec.task}: a frame has {_in_words(_shapes(columns))}, and embodiment names"
-                    f" the cameras {', '.join(robot.camera_names)}, {robot.state.width} numbers of"
-                    f" state and {robot.action.width} of an action. Correct one of the two.",
-                )
+        if robot is not None:
+            cameras = {f"{IMAGES}{camera}" for camera in robot.camera_names}
+            widths = (columns[STATE].shape[-1], columns[ACTION].shape[-1])
+            require(
+                cameras <= set(columns) and widths == (robot.state.width, robot.action.width),
+                f"{spec.task}: a frame has {_in_words(_shapes(columns))}, and embodiment names the"
+                f" cameras {', '.join(robot.camera_names)}, {robot.state.width} numbers of state"
+                f" and {robot.action.width} of an action. Correct one of the two.",
+            )
         if not success:
             return None
         columns["task"] = np.array(env.goal)
@@ -169,14 +169,18 @@ def _by_motions(env: EpisodeEnv) -> dict[str, np.ndarray]:
         row[ACTION] = np.asarray(action, np.float32)
         row[IS_DEMO] = np.array([visible])
         rows.append(row)
-        for name, value in row.items():
-            if value.shape != rows[0][name].shape:
-                raise UserError(
-                    f"{env.spec.task}, episode {env.spec.episode}: {name} of frame {len(rows) - 1}"
-                    f" has the shape {list(value.shape)}, and of frame 0"
-                    f" {list(rows[0][name].shape)}. Give the same sizes in every frame."
-                )
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return {name: _stack(env, name, [row[name] for row in rows]) for name in rows[0]}
+
+
+def _stack(env: EpisodeEnv, name: str, values: Sequence[np.ndarray]) -> np.ndarray:
+    """The column of an episode, from its frames' values."""
+    shapes = sorted({value.shape for value in values})
+    require(
+        len(shapes) == 1,
+        f"{env.spec.task}, episode {env.spec.episode}: {name} has the shapes"
+        f" {' and '.join(map(str, shapes))}. Give the same size in every frame.",
+    )
+    return np.stack(values)
 
 
 def _by_choices(
@@ -203,10 +207,13 @@ def _by_choices(
         parts.append(received)
         length += len(received["state_list"])
 
-    columns = {STATE: np.concatenate([part["state_list"] for part in parts])}
-    for camera in robot.camera_names:
-        images = [part[f"{camera}_rgb_list"] for part in parts]
-        columns[f"{IMAGES}{camera}"] = np.concatenate(images)
+    columns = {}
+    for name in robot.camera_names:
+        if f"{name}_rgb_list" in received:
+            images = [image for part in parts for image in part[f"{name}_rgb_list"]]
+            columns[f"{IMAGES}{name}"] = _stack(env, f"{IMAGES}{name}", images)
+    states = [state for part in parts for state in part["state_list"]]
+    columns[STATE] = _stack(env, STATE, states)
     columns[ACTION] = np.zeros((length, robot.action.width), np.float32)
     for frame, action in choices.items():
         columns[ACTION][frame] = action
