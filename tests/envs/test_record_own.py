@@ -141,6 +141,10 @@ def _growing_image(episode: int, time: int, given: dict[str, Any]) -> dict[str, 
     return {**given, "top": np.zeros((64 + (time > 1), 64, 3), np.uint8)}
 
 
+def _gray_image(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
+    return {**given, "top": given["top"][..., 0]}
+
+
 def _other_camera(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
     return {"side": given["top"], "state": given["state"]}
 
@@ -154,7 +158,8 @@ def _wider_state(episode: int, time: int, given: dict[str, Any]) -> dict[str, An
     [
         (_second_camera, r"Blink, episode 1: a frame has .*images\.wrist.* as in the episodes bef"),
         (_larger_image, r"Blink, episode 1: a frame has .*images\.top \[65, 64, 3\]"),
-        (_growing_image, r"Blink, episode 0: observation\.images\.top has the shapes \(64, "),
+        (_growing_image, r"Blink, episode 0: observation\.images\.top has the shape \(64, "),
+        (_gray_image, r"images\.top has the shape \(64, 64\); expected one with 3 numbers"),
         (_other_camera, r"images\.side .* embodiment names the cameras top, 1 numbers of state"),
         (_wider_state, r"state \[2\], and embodiment names the cameras top, 1 numbers of state"),
     ],

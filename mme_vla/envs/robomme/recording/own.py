@@ -174,11 +174,13 @@ def _by_motions(env: EpisodeEnv) -> dict[str, np.ndarray]:
 
 def _stack(env: EpisodeEnv, name: str, values: Sequence[np.ndarray]) -> np.ndarray:
     """The column of an episode, from its frames' values."""
+    n_axes = 3 if name.startswith(IMAGES) else 1
     shapes = sorted({value.shape for value in values})
     require(
-        len(shapes) == 1,
-        f"{env.spec.task}, episode {env.spec.episode}: {name} has the shapes"
-        f" {' and '.join(map(str, shapes))}. Give the same size in every frame.",
+        len(shapes) == 1 and len(shapes[0]) == n_axes,
+        f"{env.spec.task}, episode {env.spec.episode}: {name} has the shape"
+        f" {' and '.join(map(str, shapes))}; expected one with {counted(n_axes, 'number')}, in"
+        " every frame the same.",
     )
     return np.stack(values)
 
