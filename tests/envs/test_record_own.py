@@ -120,8 +120,8 @@ def _record_blink(monkeypatch: pytest.MonkeyPatch, output: Path, observe: Any) -
 
     def changed(self: Any, spec: EpisodeSpec, render: bool = True) -> Any:
         env = make(self, spec, render)
-        given = env.observe
-        env.observe = lambda light=False: observe(spec.episode, env.time, given(light))
+        observed = env.observe
+        env.observe = lambda light=False: observe(spec.episode, env.time, observed(light))
         return env
 
     monkeypatch.setattr(kind, "make", changed)
@@ -129,28 +129,28 @@ def _record_blink(monkeypatch: pytest.MonkeyPatch, output: Path, observe: Any) -
     record_environment(OmegaConf.create({**words, "output": str(output), "episodes": 2}))
 
 
-def _second_camera(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
-    return given | {"wrist": given["top"]} if episode else given
+def _second_camera(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return frame | {"wrist": frame["top"]} if episode else frame
 
 
-def _larger_image(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
-    return {**given, "top": np.zeros((64 + episode, 64, 3), np.uint8)}
+def _larger_image(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {**frame, "top": np.zeros((64 + episode, 64, 3), np.uint8)}
 
 
-def _growing_image(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
-    return {**given, "top": np.zeros((64 + (time > 1), 64, 3), np.uint8)}
+def _growing_image(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {**frame, "top": np.zeros((64 + (time > 1), 64, 3), np.uint8)}
 
 
-def _gray_image(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
-    return {**given, "top": given["top"][..., 0]}
+def _gray_image(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {**frame, "top": frame["top"][..., 0]}
 
 
-def _other_camera(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
-    return {"side": given["top"], "state": given["state"]}
+def _other_camera(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {"side": frame["top"], "state": frame["state"]}
 
 
-def _wider_state(episode: int, time: int, given: dict[str, Any]) -> dict[str, Any]:
-    return {**given, "state": np.zeros(2, np.float32)}
+def _wider_state(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {**frame, "state": np.zeros(2, np.float32)}
 
 
 @pytest.mark.parametrize(
@@ -169,5 +169,5 @@ def test_a_recording_refuses_frames_of_another_form_and_can_be_resumed(
 ) -> None:
     with monkeypatch.context() as changes, pytest.raises(UserError, match=words):
         _record_blink(changes, tmp_path / "data", observe)
-    _record_blink(monkeypatch, tmp_path / "data", lambda episode, time, given: given)
+    _record_blink(monkeypatch, tmp_path / "data", lambda episode, time, frame: frame)
     assert read_json(tmp_path / "data" / "meta" / "info.json", "a dataset")["total_episodes"] == 2

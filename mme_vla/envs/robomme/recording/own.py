@@ -63,9 +63,9 @@ def record_own(
     with quiet_libraries(), progress("record", len(specs), unit="episodes") as advance:
         for spec in specs:
             path = work / episode_file(spec)
-            is_kept = path.is_file()
+            is_recorded = path.is_file()
             columns: dict[str, np.ndarray] | None
-            if is_kept:
+            if is_recorded:
                 with np.load(path) as loaded:
                     columns = dict(loaded)
             else:
@@ -82,7 +82,7 @@ def record_own(
                 f" {_in_words(shapes)}, as in the episodes before. Give the same cameras and sizes"
                 " in every episode.",
             )
-            if not is_kept:
+            if not is_recorded:
                 with write_atomically(path) as temporary, temporary.open("wb") as file:
                     np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             goal = str(columns.pop("task"))
