@@ -56,7 +56,7 @@ def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("command", ["docs", "results", "sample", "train-tokenizer", "weights"])
-def test_help_describes_a_command_in_whole_sentences(
+def test_help_describes_a_command_in_sentences(
     command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["mme-vla", command, "--help"])
