@@ -127,10 +127,15 @@ def _checked_arguments(
     if unknown:
         raise unknown_option(unknown[0], words, _names(config_name, tree, []))
     require(not args.experimental_rerun, "--experimental-rerun reads pickled runs: there are none.")
+    require(
+        not args.shell_completion,
+        "--shell-completion completes a program of one command: there is none here. --help lists"
+        " the words.",
+    )
     modes = []
-    for mode in ("run", "multirun", "cfg", "info", "shell_completion"):
+    for mode in ("run", "multirun", "cfg", "info"):
         if getattr(args, mode):
-            modes.append(f"--{mode}".replace("_", "-"))
+            modes.append(f"--{mode}")
     require(len(modes) < 2, f"Use one of {' and '.join(modes)}, not both.")
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     if args.help:
@@ -140,7 +145,7 @@ def _checked_arguments(
             trees = list(library_trees())
         print(help_page(args.config_name or config_name, args.overrides, [*trees, *extra]))
         raise SystemExit(0)
-    if args.hydra_help or args.shell_completion or args.config_path:
+    if args.hydra_help or args.config_path:
         return args  # nothing of this tree is composed
     name = args.config_name or config_name
     overrides = parse(

@@ -67,9 +67,9 @@ class Inspection:
     embodiment, backbone, memory: sections that the parts' own classes read.
     """
 
-    checkpoint: str | None
-    dataset: str | None
-    exec_starts: str | None
+    checkpoint: PathText | None
+    dataset: PathText | None
+    exec_starts: PathText | None
     episode: int | None
     step: int | None
     chunks: PositiveInt | None

@@ -47,12 +47,12 @@ class RecordRun:
     episodes: Any
     split: str
     output: PathText
-    hdf5: str | None
+    hdf5: PathText | None
     lerobot: bool
-    previews: str | None
+    previews: PathText | None
     recovery: bool
     retries: PositiveInt
-    coverage: str | None
+    coverage: PathText | None
     workers: PositiveInt
     frames: Any
     memory: Mapping[str, Any] | None

@@ -23,7 +23,7 @@ class BuildSettings:
     output: PathText
     sets: tuple[Literal["simple", "grounded", "memer", "memer_simple"], ...]
     episodes: tuple[NonNegativeInt, ...] | None
-    tasks: str | None
+    tasks: PathText | None
     noise: tuple[int, int] | None
     rows: Mapping[str, Any]
     seed: NonNegativeInt

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
 from annotated_types import BaseMetadata, Ge, GroupedMetadata, Gt, Le
-from pydantic import AllowInfNan, BeforeValidator, Field
+from pydantic import AllowInfNan, BeforeValidator, Field, StringConstraints
 
 from mme_vla.errors import UserError, brief
 from mme_vla.utils.validation import unknown_key, validated
@@ -46,8 +46,8 @@ def _number_as_text(value: Any) -> Any:
     return str(value) if is_number else value
 
 
-PathText = Annotated[str, BeforeValidator(_number_as_text)]
-"""A path or a name. A command line reads a folder called `7` as a number."""
+PathText = Annotated[str, StringConstraints(pattern=r"\S"), BeforeValidator(_number_as_text)]
+"""A path or a name, never empty. A command line reads a folder called `7` as a number."""
 
 
 Secret = Annotated[

@@ -110,9 +110,6 @@ class SourceEntry:
     name: PathText | None = None
     exec_starts: PathText | None = None
 
-    def __post_init__(self) -> None:
-        require(self.root, "A data source needs its dataset folder: root=<folder>, or 'sample'.")
-
     @property
     def short_name(self) -> str:
         """The dataset's name, as `EpisodeSource` gives it."""

@@ -172,7 +172,7 @@ class TrainSettings:
 class CacheSettings:
     """Where vision caches are and how they are built: `data.cache`."""
 
-    root: str | None = None
+    root: PathText | None = None
     local: bool = False
     batch_size: PositiveInt = 32
     max_build_frames: NonNegativeInt = 5000
@@ -190,7 +190,7 @@ class DataSettings:
     mask_padding: bool = False
     jitter: bool = False
     history_transforms: Any = None
-    weights: str | None = None
+    weights: PathText | None = None
     narrow_ranges: Literal["refuse", "widen", "warn"] | None = None
     cache: CacheSettings = field(default_factory=CacheSettings)
 
@@ -227,8 +227,8 @@ class TrainRun:
     seed: Annotated[int, Range(0, 2**63 - 1)]
     output: PathText
     trainings: PositiveInt
-    resume: str | None
-    init_from: str | None
+    resume: PathText | None
+    init_from: PathText | None
     train: TrainSettings
     data: DataSettings
     finetune: FinetuneSettings

@@ -31,6 +31,7 @@ _BOUNDS = {
     "exclusiveMaximum": " below {}",
     "minLength": " of length {} or more",
     "maxLength": " of length {} or less",
+    "pattern": " that is not empty",
 }
 """Words for what a JSON schema allows."""
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")

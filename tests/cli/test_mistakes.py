@@ -178,6 +178,43 @@ def test_an_empty_output_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "train name=",
+        "train name='\t'",
+        "train resume=",
+        "train init_from=",
+        "train data.cache.root=",
+        "train data.weights=",
+        "evaluate server=ws://127.0.0.1:1 connection.name=",
+        "evaluate checkpoint=nano times_from=",
+        "record tasks=StopCube episodes=1 output=new hdf5=",
+        "record tasks=StopCube episodes=1 output=new previews=",
+        "inspect dataset=",
+        "subgoal-build input=sample output=new tasks=",
+    ],
+)
+def test_a_name_or_a_folder_that_is_empty_is_refused(
+    line: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    printed = reply(line.split(" "), monkeypatch, capsys)
+    assert "must be a text that is not empty" in printed
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [["--shell-completion"], ["-sc", "install=bash"]])
+def test_completion_by_the_shell_is_refused_in_words(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    printed = reply(["train", *words], monkeypatch, capsys)
+    assert printed.startswith("Error: --shell-completion completes a program of one command")
+
+
 @pytest.mark.parametrize("output", ["/proc/mine", "file.txt/mine", "x" * 300])
 def test_an_output_that_cannot_be_made_is_refused_before_anything_is_loaded(
     output: str,

@@ -99,7 +99,7 @@ def test_a_mistake_names_key_value_and_expectation(given: Any, message: str) -> 
 
 def test_a_folder_may_be_called_by_a_number() -> None:
     assert read_section(Outer, {"name": "a", "output": 7}).output == "7"
-    with pytest.raises(UserError, match="output=True must be a text or null"):
+    with pytest.raises(UserError, match="output=True must be a text that is not empty or null"):
         read_section(Outer, {"name": "a", "output": True})
 
 
@@ -109,7 +109,7 @@ def test_half_a_surrogate_pair_is_refused() -> None:
 
 
 def test_a_secret_is_not_reported() -> None:
-    with pytest.raises(UserError, match="must be a text or null") as error:
+    with pytest.raises(UserError, match="must be a text that is not empty or null") as error:
         read_section(Outer, {"name": "a", "secret": [5317]})
     assert "5317" not in str(error.value)
 

@@ -15,7 +15,7 @@ Subgoals = Literal["simple", "grounded"]
 class ConnectionSettings:
     """The section `connection`; the keys and their meaning are those of `configs/server.yaml`."""
 
-    name: str | None = None
+    name: PathText | None = None
     checkpoint: PathText | None = None
     api_key: Secret = field(default=None, repr=False)
     timeout_s: Positive = 600
