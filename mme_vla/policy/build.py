@@ -194,15 +194,19 @@ def build_from_config(
 
 
 def policy_config(cfg: DictConfig) -> dict[str, Any]:
-    """A command's configuration as plain values, with the embodiment of its `env`, unless another
-    than the default is selected.
+    """A command's configuration as plain values, with the embodiment of its `env` in place of
+    RoboMME's in joint angles, which is the default and what models of prior methods select.
 
     Plugins are imported first: one of them may register the environment.
     """
     import_plugins(plugins_of(cfg, "the configuration"))
     env = cfg.get("env")
     robot = cfg.get("embodiment")
-    if env is not None and robot is not None and robot.name == ROBOMME_JOINT.name:
+    if (
+        env is not None
+        and robot is not None
+        and robot.name in (ROBOMME_JOINT.name, "robomme_joint_absolute")
+    ):
         section = ENVS[env].embodiment
         if section is not None:
             cfg = copy.deepcopy(cfg)

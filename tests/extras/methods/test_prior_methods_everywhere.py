@@ -34,6 +34,7 @@ from mme_vla.extras.probing.offline import probe_offline
 from mme_vla.extras.probing.recordings import all_recordings
 from mme_vla.extras.probing.settings import OfflineSettings
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import policy_config
 from mme_vla.policy.tensor_files import load_tensors
 
 LLAMA = [*TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32"]
@@ -299,6 +300,14 @@ def test_it_stands_beside_its_paper_row(model: str) -> None:
     method = paper_method(model, subgoal)
     assert method is not None and method.family == "prior" and 0 <= average(method.name).mean < 30
     assert chunk_flops()[model] > 10**9
+
+
+@pytest.mark.parametrize("model", ["framesamp_modul", "diffusion_policy", "openvla_oft"])
+def test_an_environments_robot_is_that_of_every_model_without_another(model: str) -> None:
+    words = [f"model={model}", "env=mikasa"]
+    assert policy_config(compose("train", words))["embodiment"]["name"] == "mikasa"
+    selected = policy_config(compose("train", [*words, "embodiment=robomme_ee_delta"]))
+    assert selected["embodiment"]["name"] == "robomme_ee_delta"
 
 
 @pytest.mark.parametrize(
