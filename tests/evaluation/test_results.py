@@ -157,6 +157,16 @@ def test_the_ends_of_tangos_interval_have_the_score_of_its_level() -> None:
         assert abs(score) == pytest.approx(1.95996, abs=1e-3)
 
 
+@pytest.mark.parametrize("winner", [1.0, -1.0])
+@pytest.mark.parametrize(("tasks", "episodes"), [(6, 1), (10, 2), (13, 3), (16, 50)])
+def test_a_side_that_solves_every_episode_of_every_task_has_an_interval(
+    tasks: int, episodes: int, winner: float
+) -> None:
+    gaps = {str(task): np.full(episodes, winner) for task in range(tasks)}
+    low, high = sorted(winner * np.array(paired_interval(gaps)))
+    assert -1 <= low < high == 1.0
+
+
 def test_a_task_of_few_episodes_makes_a_difference_uncertain() -> None:
     low, high = paired_interval({"a": np.zeros(1), "b": np.zeros(99)})
     assert low < -0.45 and high > 0.45

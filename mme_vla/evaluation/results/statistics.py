@@ -164,9 +164,10 @@ def tango(gained: float, lost: float, pairs: float, confidence: float = 0.95) ->
         return float((gained - lost - pairs * delta) ** 2 - z * z * variance)
 
     low, high = -1.0, 1.0
-    if excess(-1.0) > 0:
+    # Effective numbers are rounded: where all pairs favour one side, nothing is left to search.
+    if difference - 1e-9 > -1 and excess(-1.0) > 0:
         low = brentq(excess, -1.0, difference - 1e-9)
-    if excess(1.0) > 0:
+    if difference + 1e-9 < 1 and excess(1.0) > 0:
         high = brentq(excess, difference + 1e-9, 1.0)
     return Interval(float(low), float(high))
 
