@@ -1,6 +1,5 @@
 """A whole audit: choose the scenes, run the interventions, conclude, write page and JSON."""
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -124,17 +123,18 @@ def run_audit(
             notes.append(f"{RANDOM} was left out: it needs {why}.")
     card = measure_card(policy, plan, folder, facts, settings, options, references, INTERVENTIONS)
     card = replace(card, notes=[*card.notes, *notes])
-    conclusion = conclude(card, audit.resolve)
+    conclusion = conclude(card, audit.resolve, len({job.task for job in plan.jobs}))
     _write(card, conclusion, folder, policy)
     return Audit(card, conclusion, folder / PAGE)
 
 
 def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:
     """How many scenes of each task the stated difference needs."""
-    scenes = 4
-    while resolution(scenes) > audit.resolve and scenes < 512:
+    n_tasks = max(n_tasks, 1)
+    scenes = 1
+    while resolution(scenes * n_tasks, n_tasks) > audit.resolve and scenes * n_tasks < 512:
         scenes += 1
-    return math.ceil(scenes / max(n_tasks, 1))
+    return scenes
 
 
 def _affordable_scenes(

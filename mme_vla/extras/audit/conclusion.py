@@ -65,28 +65,32 @@ class Conclusion:
 
 
 @cache
-def resolution(scenes: int) -> float:
+def resolution(scenes: int, tasks: int) -> float:
     """The smallest loss, as a share of so many scenes, that a card tells from no loss; infinite
     where none is.
 
-    It is the loss of scenes that the matched run solves and an arm never gains one.
+    It is the loss of scenes that the matched run solves and an arm never gains one. Scenes, and the
+    lost ones among them, are spread evenly over the tasks, within which a card resamples.
     """
-    keys = [EpisodeKey("", number) for number in range(scenes)]
+    keys = [EpisodeKey(str(number % tasks), number) for number in range(scenes)]
     solved = dict.fromkeys(keys, 1.0)
     for lost in range(1, scenes + 1):
         arm = solved | dict.fromkeys(keys[:lost], 0.0)
-        if grade(solved, {"": arm}, solved).arms[""].beyond_noise:
-            return lost / scenes
+        loss = grade(solved, {"": arm}, solved).arms[""]
+        if loss.beyond_noise:
+            return loss.loss
     return float("inf")
 
 
-def conclude(card: Card, target_loss: float) -> Conclusion:
+def conclude(card: Card, target_loss: float, tasks: int) -> Conclusion:
     """The conclusion of a card whose interventions are `INTERVENTIONS`.
 
     target_loss: the loss that was to be resolved.
+    tasks: how many the scenes are of.
     """
-    verdict = _verdict(card)
-    finest = max(resolution(card.scenes), card.noise)
+    limit_of_scenes = resolution(card.scenes, tasks)
+    verdict = _verdict(card, limit_of_scenes)
+    finest = max(limit_of_scenes, card.noise)
     sentences = [VERDICTS[verdict]]
     for label in (FORGET, NO_VIDEO, CONTENT, TIME, REPLAY, LAST, GOAL):
         if _loses(card, label):
@@ -115,8 +119,8 @@ def conclude(card: Card, target_loss: float) -> Conclusion:
     return Conclusion(verdict, tuple(sentences), finest if finest <= 1 else None)
 
 
-def _verdict(card: Card) -> str:
-    if card.matched < resolution(card.scenes):
+def _verdict(card: Card, limit_of_scenes: float) -> str:
+    if card.matched < limit_of_scenes:
         return "unsolved"
     if not any(_loses(card, label) for label in OF_HISTORY):
         return "goal" if _loses(card, GOAL) else "nothing"

@@ -23,6 +23,7 @@ from mme_vla.config.plugins import import_plugins
 from mme_vla.data.sources import open_sources
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.base import environment
+from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.evaluation.rollout import evaluation
 from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_jobs, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -31,7 +32,15 @@ from mme_vla.extras.audit import audit as audit_module
 from mme_vla.extras.audit.audit import Audit, AuditSettings, run_audit, scenes_a_task
 from mme_vla.extras.audit.conclusion import FORGET, INTERVENTIONS, VERDICTS, conclude, resolution
 from mme_vla.extras.audit.floor import RANDOM
-from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, measure_card, run_card
+from mme_vla.extras.probing.card import (
+    CONTENT,
+    TIME,
+    WRONG_SCENE,
+    Card,
+    grade,
+    measure_card,
+    run_card,
+)
 from mme_vla.extras.probing.recordings import Recording, all_recordings
 from mme_vla.extras.probing.run import ProbePlan
 from mme_vla.extras.trajectories.local import LocalEnvs
@@ -352,7 +361,7 @@ def test_the_cards_of_the_shipped_policy_agree(
             remote, plan, tmp_path / "outside", facts, limits, SILENT, interventions=arms
         )
     check_agreement(asdict(inside), asdict(outside))
-    assert conclude(outside, 1.0).verdict == "content"
+    assert conclude(outside, 1.0, 1).verdict == "content"
 
 
 def test_a_policy_is_audited_alike_here_and_behind_a_server(
@@ -402,7 +411,21 @@ def test_scenes_of_an_interrupted_pilot_do_not_make_a_scene_look_quick(
 
 
 def test_scenes_are_as_many_as_the_loss_needs() -> None:
-    assert [resolution(n) for n in (8, 10, 20)] == [0.5, 0.4, 0.2]
-    assert resolution(3) > 1
+    assert [resolution(n, 1) for n in (8, 10, 20)] == [0.5, 0.4, 0.2]
+    assert resolution(3, 1) > 1
     assert scenes_a_task(AuditSettings(resolve=0.4), 1) == 10
-    assert scenes_a_task(AuditSettings(resolve=0.4), 4) == 3
+    assert scenes_a_task(AuditSettings(resolve=0.4), 4) == 2
+    assert scenes_a_task(AuditSettings(resolve=0.3), 16) == 2
+
+
+@pytest.mark.parametrize("tasks", [1, 2, 5, 10])
+def test_the_smallest_loss_beyond_noise_is_the_cards_for_as_many_tasks(tasks: int) -> None:
+    # Of one scene a task nothing can be resampled: the exact interval needs more of them.
+    smallest = {1: 4, 2: 4, 5: 3, 10: 6}[tasks] / 10
+    assert resolution(10, tasks) == pytest.approx(smallest)
+    keys = [EpisodeKey(str(number % tasks), number) for number in range(10)]
+    solved = dict.fromkeys(keys, 1.0)
+    for lost in range(1, 11):
+        arm = solved | dict.fromkeys(keys[:lost], 0.0)
+        loss = grade(solved, {"": arm}, solved).arms[""]
+        assert loss.beyond_noise == (loss.loss > smallest - 1e-9)
