@@ -211,8 +211,9 @@ def encode_prompt(
         tokens += tokenizer.encode(text, bos=bos)
     if len(tokens) > max_length:
         warn_once(
-            f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise"
-            f" prompt_length. The first one, {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
+            f"A prompt has more tokens than processor.prompt_length={max_length} and loses its end,"
+            " such as the newest of past actions; raise processor.prompt_length. The first one,"
+            f" {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
             key=("truncated", max_length),
         )
         tokens = tokens[:max_length]

@@ -64,6 +64,13 @@ def test_long_prompts_lose_their_end_with_one_warning(tokenizer: Tokenizer) -> N
         encode_prompt(PROMPTS["plain"](), tokenizer, prompt, 8)
 
 
+def test_past_actions_that_do_not_fit_are_reported_with_the_key(tokenizer: Tokenizer) -> None:
+    past = np.random.default_rng(0).uniform(-1, 1, (16, 14))  # of a robot with two arms
+    prompt = PromptInput("press the button", past_actions=past)
+    with pytest.warns(UserWarning, match=r"the newest of past actions; raise processor\.prompt_le"):
+        encode_prompt(PROMPTS["past_actions"](), tokenizer, prompt, 640)
+
+
 def test_a_missing_subgoal_gives_the_goal_prompt_and_one_warning() -> None:
     prompt = PromptInput("press the button")
     with pytest.warns(UserWarning, match="no subgoal"):
