@@ -137,7 +137,11 @@ def _read_episode_columns(
                 cells += [None] * part.num_rows
             parts.append(part.select(list(kinds)).cast(pa.schema(list(kinds.items()))))
         table = pa.concat_tables(parts)
-        empty = [name for name in kinds if table[name].null_count]
+        empty = [
+            f"{name} in row {table[name].is_null().index(True).as_py()}"
+            for name in kinds
+            if table[name].null_count
+        ]
         columns = {name: table[name].to_numpy() for name in kinds}
     require(
         not empty and table.num_rows,

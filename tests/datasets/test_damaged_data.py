@@ -46,6 +46,13 @@ def at(row: int, value: Any) -> Callable[[list[Any]], list[Any]]:
     return lambda values: [*values[:row], value, *values[row + 1 :]]
 
 
+def test_an_episode_without_a_cameras_video_is_named(copy: Path) -> None:
+    name = "videos/wrist_image/from_timestamp"
+    change(copy / EPISODES, name, at(2, None))
+    with pytest.raises(UserError, match=f"empty cells in: {name} in row 2"):
+        EpisodeSource(copy)
+
+
 @pytest.mark.parametrize(
     ("file", "name", "edit", "kind", "message"),
     [
