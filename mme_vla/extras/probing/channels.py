@@ -3,7 +3,8 @@
 No network is changed: a channel gives the policy other entries in place of its own.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import starmap
 from typing import Any
@@ -16,6 +17,7 @@ from mme_vla.extras.methods.writable_memory import WritableMemory
 from mme_vla.memory.base import NEVER, MemoryModule, stack_history
 from mme_vla.memory.history import DerivedHistory, FrameScores, History, StorageSpec
 from mme_vla.memory.joined import JoinedMemory
+from mme_vla.memory.recurrent import ScheduledMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
@@ -111,6 +113,7 @@ class OnlyFrames(History):
         """
         spec = selectable(full.spec)
         every = spec.keep_every
+        self.has_gaps = int(frames[-1] - frames[0]) > every * len(frames)
         self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
         self._stored = spec.stored_frames(self._length)
         self.frames = dict(zip(self._stored.tolist(), frames.tolist(), strict=True))
@@ -280,7 +283,8 @@ class SelectionChannel(Channel):
         view: History = full if only is None else OnlyFrames(full, only)
         at = now if only is None else len(view) - 1
         names = view.frames if isinstance(view, OnlyFrames) else {}
-        frames = np.unique(self._memory.select(view, at)[:, 0]).tolist()
+        with reading_all(self._memory, view):
+            frames = np.unique(self._memory.select(view, at)[:, 0]).tolist()
         entries = tuple(Entry(names.get(frame, frame), (view, frame)) for frame in frames)
         return MemorySnapshot((Remembered(entries, now),), (view, at, frames))
 
@@ -291,7 +295,8 @@ class SelectionChannel(Channel):
         (store,) = stores
         slots = dict(zip(frames, store.entries, strict=True))
         places = {frame: entry.content for frame, entry in slots.items() if entry is not None}
-        tokens = self._memory.gather_selection(Exchanged(view, places), at)
+        with reading_all(self._memory, view):
+            tokens = self._memory.gather_selection(Exchanged(view, places), at)
         positions, mask = tokens.positions.clone(), tokens.mask.clone()
         for frame, entry in slots.items():
             its = tokens.mask & (tokens.positions[:, 0] == frame)
@@ -315,6 +320,25 @@ class SelectionChannel(Channel):
     ) -> Tensor:
         batch = replace(batch, history=stack_history(remembering, self._policy.device))
         return self._policy.sample_actions(batch, draws, steps)
+
+
+@contextmanager
+def reading_all(memory: MemoryModule, view: History) -> Iterator[None]:
+    """While this holds, memories that read every so many frames read each one of a view whose
+    frames have others between them.
+    """
+    scheduled: list[ScheduledMemory] = []
+    if isinstance(view, OnlyFrames) and view.has_gaps:
+        members = memory.memories if isinstance(memory, JoinedMemory) else [memory]
+        scheduled = [member for member in members if isinstance(member, ScheduledMemory)]
+    schedules = [member.schedule for member in scheduled]
+    try:
+        for member in scheduled:
+            member.schedule = replace(member.schedule, stride=1, every=1, jitter=0)
+        yield
+    finally:
+        for member, schedule in zip(scheduled, schedules, strict=True):
+            member.schedule = schedule
 
 
 def without_gaps(memory: MemoryModule, history: HistoryTokens) -> HistoryTokens:

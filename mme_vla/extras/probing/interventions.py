@@ -90,7 +90,8 @@ class Shuffle(Perturbation):
 @PERTURBATIONS.register("drop")
 @dataclass(frozen=True)
 class Drop(Perturbation):
-    """Some entries are taken away; the others keep slot and time.
+    """Some entries are taken away; the others keep their time, and their slot where each is read by
+    itself (`channels.without_gaps`): a recurrent memory reads on as if it had not read them.
 
     count: how many; None takes all.
     which: the `oldest`, the `newest`, at `random`, or the most `used`, those whose absence changes

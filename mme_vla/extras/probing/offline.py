@@ -129,17 +129,17 @@ class _Moments:
             for step in self._decisions:
                 if self._subgoal_kind is not None:
                     episode.subgoal = recording.subgoal(step, self._subgoal_kind)
+                if step in steps:
+                    recording.show(episode, n_observed, step + 1, required)
+                    n_observed = step + 1
+                    boundaries = np.array(sorted(self._boundaries), np.int64)
+                    episode.boundaries = episode.numbers(boundaries)
+                    if step in self._steps:
+                        for probed in arms:
+                            result += self._probe(probed, episode, step)
+                    episode.inner.subgoal = episode.subgoal
+                    self._policy.act([episode.inner], self._settings.flow_steps)
                 episode.subgoals.append(episode.subgoal)
-                if step not in steps:
-                    continue
-                recording.show(episode, n_observed, step + 1, required)
-                n_observed = step + 1
-                episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
-                if step in self._steps:
-                    for probed in arms:
-                        result += self._probe(probed, episode, step)
-                episode.inner.subgoal = episode.subgoal
-                self._policy.act([episode.inner], self._settings.flow_steps)
         return result
 
     def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:

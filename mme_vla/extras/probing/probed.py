@@ -36,7 +36,7 @@ class ProbedEpisode(Episode):
     exec_start: the first execution frame, once it is observed.
     boundaries: observed frames at which sub-tasks began, where the environment reports them.
     recording: the recorded episode, if it is one.
-    subgoals: those that were set at each chunk so far.
+    subgoals: those that were set at each chunk before the current one.
     """
 
     policy: "ProbedPolicy"
@@ -47,7 +47,6 @@ class ProbedEpisode(Episode):
         self.seed = seed
         self.inner = policy.inner.start_episode(goal, seed)
         self.exec_start: int | None = None
-        self._decisions = 0
         self._collected: Shown | None = None
         """Frames since the last decision, where the arm changes them; with `renews` all frames."""
         self._start: np.ndarray | None = None
@@ -158,15 +157,15 @@ class ProbedEpisode(Episode):
         before = self._before or {name: view[:0] for name, view in collected.views.items()}
         shown = arm.show(replace(collected, before=before), self.policy.moment(self))
         if arm.renews:
-            # Another seed at each decision: the noise of one is not that of the others.
-            if self._decisions:
+            # Another seed at each decision: the noise of one is not that of the others. A decision
+            # that failed, such as for memory, is repeated: it is still the same one.
+            if self.inner.n_observed_frames > self.policy.n_before:
                 self.inner.close()
-                self.inner = self.policy.inner.start_episode("", self.seed + self._decisions)
+                self.inner = self.policy.inner.start_episode("", self.seed + len(self.subgoals))
                 _show_all(self.policy.sessions, self.inner, self.policy.inner)
             self.inner.options = self.options
         else:
             self._collected = None
-        self._decisions += 1
         if arm.lag and not arm.renews:
             for name, view in collected.views.items():
                 executed = view[~collected.demo]
@@ -203,6 +202,7 @@ class ProbedEpisode(Episode):
 
     def acted(self, chunk: np.ndarray) -> None:
         self.inner.acted(chunk)
+        self.subgoals.append(self.subgoal)
 
     def add_frames(self, *_: Any, **__: Any) -> None:
         """Not offered: a feed decides on whole observations."""
@@ -381,7 +381,6 @@ class ProbedPolicy(Policy):
             episode.show_collected()
             moment = self.moment(episode)
             episode.inner.goal = self.arm.instruct(episode.goal, moment)
-            episode.subgoals.append(episode.subgoal)
             episode.inner.subgoal = self.arm.say(episode.subgoal, moment)
             inner.append(episode.inner)
         return self.inner.observation(inner)
@@ -441,7 +440,8 @@ class ProbedPolicy(Policy):
                 "donor_recording": donor.recording,
                 "donor_goal": self.donors.goal_for(episode),
             }
-        return Moment(rng, now, stored, episode.boundaries, episode.subgoals, weigh=weigh, **known)
+        subgoals = [*episode.subgoals, episode.subgoal]
+        return Moment(rng, now, stored, episode.boundaries, subgoals, weigh=weigh, **known)
 
     def _weigh(
         self,

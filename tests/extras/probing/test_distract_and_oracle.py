@@ -61,9 +61,24 @@ class Noting(ProbedPolicy):
         return match
 
 
-@pytest.mark.parametrize("arm", ["oracle", "pause:8+oracle"])
-def test_in_closed_loop_an_oracle_keeps_the_frames_at_which_subtasks_began(arm: str) -> None:
-    probe = Noting(quick_policy("framesamp_modul", 8).eval(), read_arm(arm)).eval()
+JOINED = {"memory": [{"name": "framesamp", "budget": 64}, {"name": "ttt", "budget": 64}]}
+
+
+@pytest.mark.parametrize(
+    ("model", "arm"),
+    [
+        ("framesamp_modul", "oracle"),
+        ("framesamp_modul", "pause:8+oracle"),
+        ("ttt_modul", "oracle"),
+        ("rmt_expert", "pause:8+oracle"),
+        ("framesamp_context", "oracle"),
+    ],
+)
+def test_in_closed_loop_an_oracle_keeps_the_frames_at_which_subtasks_began(
+    model: str, arm: str
+) -> None:
+    options = JOINED if model == "framesamp_context" else {}
+    probe = Noting(quick_policy(model, 8, **options).eval(), read_arm(arm)).eval()
     probe.noted = []
     roll(
         probe,

@@ -245,8 +245,46 @@ def test_subgoals_can_be_wrong_by_one_or_late(word: str, message: str, expected:
     policy = quick_policy("simplesg")
     probe = ProbedPolicy(policy, read_arm(word))
     episode = probe.start_episode("press the button")
-    episode.subgoals = ["the second thing", message]
+    episode.subgoals = ["the second thing"]
+    episode.subgoal = message
     assert probe.arm.say(message, probe.moment(episode)) == expected
+
+
+@pytest.mark.parametrize(
+    ("model", "word"), [("simplesg", "subgoal_delay:1"), ("framesamp_modul", "forget")]
+)
+def test_a_decision_that_is_repeated_after_a_failure_is_the_same_one(
+    model: str, word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = quick_policy(model, 8).eval()
+    recording = made_up()[0]
+    fails: list[bool] = []
+
+    def decisions(probe: ProbedPolicy) -> tuple[list[np.ndarray], ProbedEpisode]:
+        episode = probe.start_episode(recording.goal, 5)
+        actions, n_frames = [], 0
+        for now in (20, 36, 52):
+            episode.subgoal = f"the one of step {now}"
+            recording.show(episode, n_frames, now + 1)
+            n_frames = now + 1
+            state = episode.noise_state
+            for _ in fails:
+                monkeypatch.setattr(probe, "predict_chunk", out_of_memory)
+                with pytest.raises(torch.OutOfMemoryError):
+                    probe.act(episode, 2)
+                monkeypatch.undo()
+                episode.noise_state = state
+            actions.append(probe.act(episode, 2))
+        return actions, episode
+
+    def out_of_memory(*_: Any, **__: Any) -> Any:
+        raise torch.OutOfMemoryError
+
+    expected, _ = decisions(ProbedPolicy(policy, read_arm(word)).eval())
+    fails.append(True)
+    repeated, episode = decisions(ProbedPolicy(policy, read_arm(word)).eval())
+    assert all(np.array_equal(*pair) for pair in zip(expected, repeated, strict=True))
+    assert episode.subgoals == [f"the one of step {now}" for now in (20, 36, 52)]
 
 
 def test_a_subgoal_of_another_episode_reaches_the_prompt() -> None:
