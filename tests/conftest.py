@@ -1,6 +1,9 @@
 """Fixtures that find the data beside the repository, and skip clearly where it is absent."""
 
+import logging
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 # Tests run in parallel (`pytest -n auto`): one thread each, as many tests as there are cores.
@@ -27,6 +30,23 @@ def _isolated_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     from mme_vla.config import plugins
 
     monkeypatch.setattr(plugins, "_imported", dict(plugins._imported))
+
+
+@pytest.fixture(autouse=True)
+def _open_log_streams() -> Iterator[None]:
+    """Point log handlers away from the captured streams that a test closes when it ends: a later
+    test would print "Logging error" where they write.
+
+    Hydra, `log_to_terminal` and packages that a test is the first to import leave such handlers.
+    """
+    root = logging.root
+    level = root.level
+    yield
+    root.setLevel(level)
+    for logger in [root, *root.manager.loggerDict.values()]:
+        for handler in getattr(logger, "handlers", ()):  # a placeholder has none
+            if type(handler) is logging.StreamHandler and handler.stream.closed:
+                handler.stream = sys.stderr  # `setStream` would flush the closed one
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
