@@ -338,6 +338,7 @@ class EpisodeEnv:
         self.max_steps = max_steps
         self.render_request: RenderRequest | None = None
         self.goal = ""
+        self._renders = render
         self._key = (type(environment), spec.task, render)
         self._is_reusable = True  # no call has failed
         self._by_choice = by_choice
@@ -518,6 +519,11 @@ class EpisodeEnv:
         # Every frame has the names of the first, or images would be of other frames than states.
         if self._frames == 0:
             require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
+            require(
+                len(frame) > 1 or not self._renders,
+                f"{self.spec.task}: observations have no image: give one for each camera (uint8"
+                " [H, W, 3], or a function that renders it), or open it with render=False.",
+            )
             self._names = set(frame)
         place = f"{self.spec.task}: frame {self._frames} of the episode"
         remedy = "Give the same cameras and the state in every observation."

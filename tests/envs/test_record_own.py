@@ -153,9 +153,14 @@ def _wider_state(episode: int, time: int, frame: dict[str, Any]) -> dict[str, An
     return {**frame, "state": np.zeros(2, np.float32)}
 
 
+def _lost_state(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {**frame, "state": frame["state"] * (np.nan if time == 2 else 1)}
+
+
 @pytest.mark.parametrize(
     ("observe", "words"),
     [
+        (_lost_state, r"episode 0: observation\.state has numbers that are not .* in frame 6\."),
         (_second_camera, r"Blink, episode 1: a frame has .*images\.wrist.* as in the episodes bef"),
         (_larger_image, r"Blink, episode 1: a frame has .*images\.top \[65, 64, 3\]"),
         (_growing_image, r"Blink, episode 0: observation\.images\.top has the shape \(64, "),

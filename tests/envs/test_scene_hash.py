@@ -81,6 +81,11 @@ class Lines(Environment):
         return Line()
 
 
+def test_an_environment_that_renders_gives_an_image() -> None:
+    with pytest.raises(UserError, match="no image: give one for each camera"):
+        Lines().open("Line", "test", 0).reset()
+
+
 class NamedLines(Lines):
     def scene_values(self, env: Any) -> Mapping[str, Any] | None:
         return {"place": env.place}
@@ -88,7 +93,7 @@ class NamedLines(Lines):
 
 def test_an_environment_without_values_says_so() -> None:
     source = Lines()
-    env = source.open("Line", "test", 0)
+    env = source.open("Line", "test", 0, render=False)
     assert env.scene_digest == NOT_BUILT
     env.reset()
     assert env.scene_digest == source.scene_digest(source.episode("Line", "test", 0)) == NO_VALUES
@@ -96,7 +101,7 @@ def test_an_environment_without_values_says_so() -> None:
 
 def test_an_environment_with_values_is_named_by_those_of_its_reset() -> None:
     source = NamedLines()
-    env = source.open("Line", "test", 1)
+    env = source.open("Line", "test", 1, render=False)
     env.reset()
     env.step(None)
     digest = scene_digest({"place": 500_001.0})

@@ -182,7 +182,14 @@ def _stack(env: EpisodeEnv, name: str, values: Sequence[np.ndarray]) -> np.ndarr
         f" {' and '.join(map(str, shapes))}; expected one with {counted(n_axes, 'number')}, in"
         " every frame the same.",
     )
-    return np.stack(values)
+    column = np.stack(values)
+    is_finite = np.isfinite(column).reshape(len(column), -1).all(1)
+    require(
+        is_finite.all(),
+        f"{env.spec.task}, episode {env.spec.episode}: {name} has numbers that are not finite, first"
+        f" in frame {is_finite.argmin()}.",
+    )
+    return column
 
 
 def _by_choices(
