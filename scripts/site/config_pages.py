@@ -62,7 +62,7 @@ def keys(file: Path) -> list[Key]:
     return result
 
 
-MARKUP = {"<": "&lt;", ">": "&gt;", "*": r"\*", "{": "&#123;", "}": "&#125;"}
+MARKUP = {"<": "&lt;", ">": "&gt;", "*": r"\*", "[": r"\[", "{": "&#123;", "}": "&#125;"}
 """Characters of a comment that mean something in Markdown or its extension for attributes."""
 PAGE = re.compile(r"docs/([\w/-]+\.md)(#[\w-]+)?")
 

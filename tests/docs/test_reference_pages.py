@@ -124,6 +124,7 @@ def test_comments_become_markdown() -> None:
         == r"train \| val, `a\|b` in &lt;folder&gt;, 2\*3"
     )
     assert config_pages.prose("such as {vlm: 0.1}") == "such as &#123;vlm: 0.1&#125;"
+    assert config_pages.prose("seed[-<split>][-x]") == r"seed\[-&lt;split&gt;]\[-x]", "no link"
     linked = config_pages.prose("see docs/train/weights.md#formats.", "reference/configuration")
     assert linked == "see [Weights](../../train/weights.md#formats)."
     assert config_pages.prose("docs/no/page.md") == "docs/no/page.md"

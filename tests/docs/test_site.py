@@ -18,7 +18,7 @@ from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError
 from mme_vla.utils.style import css
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.slow
 
 
 class Page(HTMLParser):
