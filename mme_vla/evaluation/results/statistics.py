@@ -291,8 +291,10 @@ def sampled_interval(values: np.ndarray, exact: Interval) -> Interval:
 def resampled_means(
     tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int
 ) -> np.ndarray:
-    """Means over tasks of each method [methods, samples], of episodes sampled within each task
-    (Efron and Tibshirani 1993).
+    """Means over tasks of each method [methods, samples], of episodes sampled within each task.
+
+    n episodes give samples of n − 1: the variance of their means is the unbiased one (McCarthy and
+    Snowden 1985), which samples of n miss by the factor (n − 1) / n. One episode gives itself.
 
     tasks: for each task one array of [episodes] a method. An episode is sampled for all methods
         alike.
@@ -301,6 +303,6 @@ def resampled_means(
     means: Any = 0
     for values_of_methods in tasks.values():
         n_episodes = len(values_of_methods[0])
-        sampled = rng.integers(0, n_episodes, (samples, n_episodes))
+        sampled = rng.integers(0, n_episodes, (samples, max(n_episodes - 1, 1)))
         means = means + np.stack([values[sampled].mean(1) for values in values_of_methods])
     return means / len(tasks)
