@@ -31,7 +31,7 @@ import pandas as pd
 from mme_vla.errors import check_known, counted
 from mme_vla.evaluation.results.baselines import missing_baselines
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
-from mme_vla.evaluation.results.statistics import percentiles
+from mme_vla.evaluation.results.statistics import percentiles, resampled_means
 from mme_vla.evaluation.store import read_folders
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS
 from mme_vla.extras.nano.board import Board, published_success, spearman
@@ -314,8 +314,8 @@ def agreements(rows: Sequence[Mapping[str, str]], samples: int = 2000) -> list[s
                 continue
             values = by_task[common].to_numpy()
             published = np.array([known[model] for model in common])
-            draws = np.random.default_rng(0).integers(len(values), size=(samples, len(values)))
-            low, high = percentiles(spearman(values[draws].mean(axis=1), published))
+            draws = resampled_means({"": list(values.T)}, samples, seed=0).round(9)
+            low, high = percentiles(spearman(draws.T, published))
             models, tasks = counted(len(common), "model"), counted(len(values), "task")
             correlation = spearman(values.mean(axis=0), published)
             sentences.append(

@@ -30,6 +30,7 @@ from mme_vla.evaluation.results.statistics import (
     mean_interval,
     paired_interval,
     paired_test,
+    resampled_means,
     sign_test,
     tango,
     wilson,
@@ -222,6 +223,21 @@ def test_one_training_and_one_episode_leave_their_variance_out() -> None:
     alone = estimate([[np.array([[1.0], [0.0]])]])
     assert alone.value == 0.5 and alone.error == pytest.approx(0.5) and alone.freedom == 1
     assert estimate([[np.ones((1, 1))]]) == (1.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("n_episodes", [2, 3, 25])
+def test_resampled_means_vary_as_much_as_means_of_other_episodes_do(n_episodes: int) -> None:
+    rng = np.random.default_rng(n_episodes)
+    variances = []
+    for seed in range(2000):
+        tasks = {name: [rng.random(n_episodes)] for name in "ab"}
+        variances.append(resampled_means(tasks, samples=100, seed=seed).var(ddof=1))
+    # A number between 0 and 1 has the variance 1/12. Samples of all 25 episodes miss 4 %.
+    assert np.mean(variances) == pytest.approx(1 / 12 / n_episodes / 2, rel=0.03)
+
+
+def test_one_episode_is_its_only_sample() -> None:
+    assert (resampled_means({"a": [np.array([0.25])]}, samples=20, seed=0) == 0.25).all()
 
 
 def test_intervals_of_a_difference_never_contradict_the_test() -> None:

@@ -12,6 +12,7 @@ All of them hold for three episodes as well as for 800. Rates are shares (0 to 1
   Several of them: Holm (1979).
 - Several trainings: Student's t with the degrees of freedom of Welch (1938) and Satterthwaite
   (1946), for the variance between episodes and the one between trainings.
+- A bootstrap: samples of n − 1 of n episodes (McCarthy and Snowden 1985).
 """
 
 import math
@@ -293,8 +294,8 @@ def resampled_means(
 ) -> np.ndarray:
     """Means over tasks of each method [methods, samples], of episodes sampled within each task.
 
-    n episodes give samples of n − 1: the variance of their means is the unbiased one (McCarthy and
-    Snowden 1985), which samples of n miss by the factor (n − 1) / n. One episode gives itself.
+    Means of n − 1 of n episodes have the unbiased variance, those of n the (n − 1) / n of it. One
+    episode gives itself.
 
     tasks: for each task one array of [episodes] a method. An episode is sampled for all methods
         alike.

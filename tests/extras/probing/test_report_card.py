@@ -265,14 +265,7 @@ def assert_card_follows_from_its_records(folder: Path) -> None:
     assert card.scenes == figures["scenes"], folder.name
     for label, loss in card.arms.items():
         published = figures["arms"][label]
-        if published["low"] == published["high"]:
-            # Cards of earlier versions had no width where all scenes agree.
-            assert loss.low < published["low"] < loss.high and not loss.beyond_noise
-            published |= {"low": loss.low, "high": loss.high}
-        assert to_json(asdict(loss)) == pytest.approx(published), (
-            folder.name,
-            label,
-        )
+        assert to_json(asdict(loss)) == pytest.approx(published), (folder.name, label)
     score = to_json(asdict(card.memory_or_clock))
     assert score == pytest.approx(figures["memory_or_clock"]), folder.name
     scores = clock_scores(matched, arms, again, {})
