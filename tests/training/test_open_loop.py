@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from helpers.lerobot_tables import write_dataset
@@ -14,7 +15,7 @@ from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.recording import Recording
 from mme_vla.embodiment import Embodiment
-from mme_vla.testing.small import SMALL_VISION, unit_stats
+from mme_vla.testing.small import SMALL_VISION, small_policy, unit_stats
 from mme_vla.training.open_loop import (
     LAST,
     MEAN,
@@ -202,3 +203,18 @@ def test_a_last_frame_that_no_action_follows_is_not_compared(policy: MMEPolicy) 
     source.exec_starts[0] = last
     with pytest.raises(UserError, match="no step at which this robot decides and an action"):
         open_loop(policy, Recording(source, 0, 1), "one frame")
+
+
+def test_a_policy_with_past_views_sees_those_of_every_camera(sample: EpisodeSource) -> None:
+    policy = small_policy("spacetime_modul", memory={"frames": 3, "stride": 5})
+    policy.require_processor().stats = unit_stats(policy.embodiment)
+    recording = Recording(sample, 3)
+    steps = open_loop(policy, recording, "", 2).steps
+    last = int(steps[-1])
+    every_frame, required_alone = policy.start_episode(""), policy.start_episode("")
+    recording.show(every_frame, 0, last + 1)
+    required = policy.frames_read(steps, recording.exec_start)
+    recording.show(required_alone, 0, last + 1, required)
+    expected, past = every_frame.past, required_alone.past
+    assert expected is not None and past is not None and past.mask.all()
+    assert torch.equal(past.images, expected.images)
