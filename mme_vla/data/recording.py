@@ -53,13 +53,13 @@ class Recording:
         return [int(step) for step in steps]
 
     def views(
-        self, start: int, stop: int, required: np.ndarray | None, past_views: bool = False
+        self, start: int, stop: int, required: np.ndarray | None, every_camera: bool = False
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
         """Images of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
 
         required: frames that the memory camera shows beside the last, which all cameras do; None
             for every frame.
-        past_views: all cameras show the required frames.
+        every_camera: all cameras show the required frames.
 
         Raises:
             UserError: the robot reads depth, which a dataset has no columns for.
@@ -75,7 +75,7 @@ class Recording:
             frames: np.ndarray = np.arange(start, stop)
             if required is not None:
                 frames = np.array([stop - 1])
-                if past_views or name == robot.memory_camera:
+                if every_camera or name == robot.memory_camera:
                     inside = (required >= start) & (required < stop)
                     frames = np.union1d(required[inside], frames)
             views[name] = self.source.frames(self.episode, frames, name)
@@ -117,8 +117,8 @@ class Recording:
             actions = self.source.actions(self.episode)[frames - 1 + self.action_offset]
         states = self.source.states(self.episode, start, stop)
         memory = running.policy.memory
-        past_views = memory is not None and memory.past_view_spec is not None
-        views, rendered = self.views(start, stop, required, past_views)
+        every_camera = memory is not None and memory.past_view_spec is not None
+        views, rendered = self.views(start, stop, required, every_camera)
         running.observe(views, states, demo, actions, rendered=rendered)
 
 

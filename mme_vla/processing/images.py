@@ -121,7 +121,7 @@ def _fit(source_h: int, source_w: int, height: int, width: int) -> tuple[int, in
     top, left).
     """
     ratio = max(source_w / width, source_h / height)
-    inner_h, inner_w = int(source_h / ratio), int(source_w / ratio)
+    inner_h, inner_w = max(int(source_h / ratio), 1), max(int(source_w / ratio), 1)
     return inner_h, inner_w, (height - inner_h) // 2, (width - inner_w) // 2
 
 

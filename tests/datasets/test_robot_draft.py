@@ -54,6 +54,12 @@ def test_cameras_widths_names_and_rate_are_the_datasets() -> None:
     find_columns(Path("data"), info.features, robot)
 
 
+@pytest.mark.parametrize("fps", [15.0, 12.5, 30000 / 1001])
+def test_the_rate_is_the_datasets_to_the_last_digit(fps: float) -> None:
+    info = info_of(fps, observation__images__top=IMAGE, state=vector("x"), action=vector("x"))
+    assert robot_of(drafted(info)).fps == fps
+
+
 def test_guesses_are_marked() -> None:
     draft = drafted(info_of(top=IMAGE, observation__state=vector(width=2), action=vector(width=2)))
     marked = [line.partition(":")[0] for line in draft.open_lines]

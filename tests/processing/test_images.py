@@ -100,3 +100,11 @@ def test_resizing_refuses_other_shapes_and_types() -> None:
         resize_with_pad(torch.zeros(3, 8, 8), 4)
     with pytest.raises(UserError, match="int64"):
         resize_with_pad(torch.zeros(1, 8, 8, 3, dtype=torch.int64), 4)
+
+
+@pytest.mark.parametrize("size", [(4, 1000), (1000, 4)])
+def test_an_image_much_longer_than_wide_becomes_a_line(size: tuple[int, int]) -> None:
+    frames = np.full((1, *size, 3), 255, np.uint8)
+    resized = resize_with_pad_uint8(frames, 224)
+    assert (resized > 0).any(-1).sum() == 224
+    assert (resize_with_pad(torch.from_numpy(frames), 224) > 0).any(1).sum() == 224

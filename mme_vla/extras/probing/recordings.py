@@ -47,14 +47,14 @@ class Recording(recording.Recording):
         return sorted({0, self.exec_start, *changes})
 
     def views(
-        self, start: int, stop: int, required: np.ndarray | None, past_views: bool = False
+        self, start: int, stop: int, required: np.ndarray | None, every_camera: bool = False
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
         """As `recording.Recording.views`. A robot that reads depth observes the frames that the
         dataset keeps depth of.
         """
         robot = self.source.robot
         if not robot.readings:
-            return super().views(start, stop, required, past_views)
+            return super().views(start, stop, required, every_camera)
         keyframes = EpisodeKeyframes(KeyframeFile.file_of(self.source.root, self.episode))
         keyframes.check(self.length)
         here = keyframes.frames[(keyframes.frames >= start) & (keyframes.frames < stop)]
