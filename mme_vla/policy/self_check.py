@@ -365,7 +365,6 @@ def relative_difference(chunk: np.ndarray, stored: np.ndarray) -> float:
     return difference / size
 
 
-@torch.compiler.set_stance("force_eager")  # one chunk is not worth compiling for
 @torch.no_grad()
 def predict_chunk(
     policy: "Policy", check: SelfCheck, stored: bool = False
@@ -383,7 +382,8 @@ def predict_chunk(
     if _precision_of(policy) == "float32":
         policy.compute_dtype = torch.float32
     try:
-        with torch.random.fork_rng(devices=devices):
+        # one chunk is not worth compiling for
+        with torch.compiler.set_stance("force_eager"), torch.random.fork_rng(devices=devices):
             torch.manual_seed(_SEED)  # of what is sampled beside the noise
             episode = policy.start_episode(check.about.goal, _SEED)
             if policy.require_processor().prompt_spec.reads_subgoal:

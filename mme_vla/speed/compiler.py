@@ -27,13 +27,15 @@ def keep_compiled_code() -> Path:
     checkpoint: compiled code is executed, and a checkpoint may come from anybody. Where
     `TORCHINDUCTOR_CACHE_DIR` is set, it names the folder.
     """
-    if CACHE_VARIABLE not in os.environ:
+    from torch._inductor import config
+    from torch._inductor.runtime.cache_dir_utils import default_cache_dir
+
+    # Where nobody set it, that import sets it: to a folder among the temporary ones of all users.
+    if os.environ.get(CACHE_VARIABLE, default_cache_dir()) == default_cache_dir():
         folder = user_cache("compiled")
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o700)
         os.environ[CACHE_VARIABLE] = str(folder)
-    from torch._inductor import config
-
     cacheable = dict.fromkeys(CHOICE_OF_KERNELS, torch.__version__)
     config.unsafe_marked_cacheable_functions = config.unsafe_marked_cacheable_functions | cacheable
     return Path(os.environ[CACHE_VARIABLE])

@@ -141,7 +141,6 @@ def decisions_of(recording: Recording, execute: int, most: int | None) -> list[i
     return steps
 
 
-@torch.compiler.set_stance("force_eager")  # a few chunks are not worth compiling for
 def open_loop(
     policy: Policy,
     recording: Recording,
@@ -185,23 +184,26 @@ def open_loop(
     valid: list[np.ndarray] = []
     baselines: dict[str, list[np.ndarray]] = {}
     n_observed = 0
-    for step in steps:
-        recording.show(episode, n_observed, step + 1, required)
-        n_observed = step + 1
-        # An episode may have several tasks, one after the other.
-        episode.goal = source.goal(number, step)
-        if subgoal is not None:
-            episode.subgoal = source.subgoals(number, step)[subgoal]
-        with torch.no_grad():
+    # A few chunks are not worth compiling for.
+    with torch.no_grad(), torch.compiler.set_stance("force_eager"):
+        for step in steps:
+            recording.show(episode, n_observed, step + 1, required)
+            n_observed = step + 1
+            # An episode may have several tasks, one after the other.
+            episode.goal = source.goal(number, step)
+            if subgoal is not None:
+                episode.subgoal = source.subgoals(number, step)[subgoal]
             chunk = policy.act(episode)
-        actions, is_known = source.action_chunk(number, step, len(chunk), recording.action_offset)
-        predicted.append(chunk)
-        recorded.append(actions)
-        valid.append(is_known)
-        for name, action in _baselines(policy, recording, step).items():
-            baselines.setdefault(name, []).append(action)
-        if advance is not None:
-            advance(1)
+            actions, is_known = source.action_chunk(
+                number, step, len(chunk), recording.action_offset
+            )
+            predicted.append(chunk)
+            recorded.append(actions)
+            valid.append(is_known)
+            for name, action in _baselines(policy, recording, step).items():
+                baselines.setdefault(name, []).append(action)
+            if advance is not None:
+                advance(1)
 
     stats = policy.require_processor().require_stats()
     half_range = (stats.actions.q99 - stats.actions.q01) / 2

@@ -144,9 +144,6 @@ class Validation:
         self.indices = np.linspace(0, size - 1, min(count, size)).round().astype(int).tolist()
         self._batches: list[Any] = []
 
-    # Compiled code of the training step does not fit here, and a few batches are not worth code of
-    # their own.
-    @torch.compiler.set_stance("force_eager")
     @torch.no_grad()
     def loss(
         self,
@@ -183,7 +180,10 @@ class Validation:
             draws = {}
             for name in rows[0]:
                 draws[name] = torch.cat([row[name] for row in rows]).to(policy.device)
-            loss, _ = policy(self._batches[number].to(policy.device), draws)
+            # Compiled code of the training step does not fit here, and a few batches are not worth
+            # code of their own.
+            with torch.compiler.set_stance("force_eager"):
+                loss, _ = policy(self._batches[number].to(policy.device), draws)
             if counts:
                 total += float(loss) * len(indices)
         policy.train(was_training)

@@ -51,8 +51,8 @@ WITHOUT = {
         [],
         (
             "import sys, mme_vla; from mme_vla import Policy, build_policy; import"
-            " mme_vla.training.loop\nassert not {'diffusers', 'torchvision', 'transformers'} &"
-            " set(sys.modules), 'there, but not needed'"
+            " mme_vla.training.loop\nassert not {'diffusers', 'torchvision', 'transformers',"
+            " 'torch._dynamo'} & set(sys.modules), 'there, but not needed'"
         ),
     ),
     "environments": (

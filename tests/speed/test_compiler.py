@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch._dynamo.utils import counters
+from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.functional import scaled_dot_product_attention
 
@@ -44,6 +45,13 @@ def test_a_folder_that_the_user_names_is_taken(
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "elsewhere"))
     assert keep_compiled_code() == tmp_path / "elsewhere"
     assert not (tmp_path / "cache").exists()
+
+
+def test_a_folder_that_pytorch_chose_itself_is_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, default_cache_dir())  # as importing its compiler does
+    assert keep_compiled_code() == tmp_path / "cache" / "compiled"
 
 
 def attend_with_math(x: Tensor) -> Tensor:
