@@ -147,9 +147,7 @@ def open_run(
             beside = [
                 path for path in folder.parent.glob("*") if checkpoints_in(path / CHECKPOINTS)
             ]
-            latest = max(
-                beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, default=None
-            )
+            latest = max(beside, key=newest_write, default=None)
             if latest is not None and not (latest / SUMMARY).is_file():
                 newest = checkpoints_in(latest / CHECKPOINTS)[-1]
         if newest is None:

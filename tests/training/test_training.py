@@ -19,7 +19,7 @@ from helpers.trainings import RECIPE, SMALL, Samples, collate, loggers, policy, 
 from mme_vla import MMEPolicy, UserError
 from mme_vla.config.composition import compose
 from mme_vla.policy.build import build_from_config
-from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
+from mme_vla.policy.run_folders import checkpoints_in, find_run, resolve_checkpoint
 from mme_vla.training.checkpoint import check_disk
 from mme_vla.training.data import check_frozen
 from mme_vla.training.logging import ProgressLine, check_logger, open_loggers, read_metrics
@@ -216,6 +216,20 @@ def test_auto_resumes_the_newest_unfinished_run_or_begins(two_steps: Path, tmp_p
     assert open_run(tmp_path / "a", "auto", config, named=True).step == 2
     (tmp_path / "a" / "summary.json").write_text("{}")
     assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
+
+
+def test_a_run_whose_old_checkpoint_was_deleted_is_not_the_newest(
+    two_steps: Path, tmp_path: Path
+) -> None:
+    config = {"train": {**RECIPE, "steps": 9}, "seed": 1}
+    for name, hour in (("early", 1), ("late", 2)):
+        shutil.copytree(two_steps, tmp_path / name)
+        (checkpoint,) = checkpoints_in(tmp_path / name / "checkpoints")
+        os.utime(checkpoint, (hour * 3600, hour * 3600))
+    (tmp_path / "early" / "checkpoints" / "step_000001").mkdir()
+    (tmp_path / "early" / "checkpoints" / "step_000001").rmdir()
+    assert open_run(tmp_path / "new", "auto", config).folder == tmp_path / "late"
+    assert find_run(tmp_path / "latest") == tmp_path / "late"
 
 
 def test_a_finished_run_that_trains_on_is_unfinished_again(tmp_path: Path) -> None:
