@@ -240,8 +240,9 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
     """Read a regular file of at most `limit` bytes."""
     try:
         # A pipe without a writer would block in open(); a device would never end.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        with os.fdopen(descriptor, "rb") as file:
+        with open(
+            path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)
+        ) as file:
             status = os.fstat(file.fileno())
             require(stat.S_ISREG(status.st_mode), f"{path} is not a file; expected {what}.")
             require(

@@ -74,6 +74,16 @@ def test_whatever_stands_in_a_files_place_is_refused_without_waiting(tmp_path: P
             read_text(tmp_path / name, limit=100)
 
 
+def test_a_file_that_is_refused_is_not_left_open(tmp_path: Path) -> None:
+    (tmp_path / "large").write_bytes(b" " * 101)
+    (tmp_path / "folder").mkdir()
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for name in ("large", "folder"):
+        with pytest.raises(UserError):
+            read_text(tmp_path / name, limit=100)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
 def named(row: dict[str, Any]) -> dict[str, Any]:
     require("name" in row, "there is no name")
     return row
