@@ -45,7 +45,7 @@ from mme_vla.training.runs import (
     weights_to_start_from,
 )
 from mme_vla.training.settings import TrainRun
-from mme_vla.utils import remove_drafts, started_processes, write_atomically
+from mme_vla.utils import started_processes, write_atomically
 
 
 def main(cfg: DictConfig) -> None:
@@ -220,7 +220,6 @@ def _train(
     loggers = Loggers()
     if first:
         loggers = open_loggers(place.folder, saved_config, place.step, run.logger)
-        remove_drafts(place.folder)
         with write_atomically(place.folder / CONFIG) as draft:
             OmegaConf.save(OmegaConf.create(config), draft)
     with closing(loggers):

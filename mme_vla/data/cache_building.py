@@ -36,7 +36,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import score_frame
-from mme_vla.utils import remove_drafts, sum_line, write_atomically, write_json
+from mme_vla.utils import sum_line, write_atomically, write_json
 
 PAGE = 4096  # bytes
 CHUNKS_AHEAD = 2
@@ -84,7 +84,6 @@ def build_cache(
             check_fingerprint(folder, expected)
         write_json(folder / FINGERPRINT, expected, indent=1)
     check_fingerprint(folder, expected)
-    remove_drafts(folder)
     share = list(range(rank, len(source), world))
     missing = [episode for episode in share if not token_file(folder, episode).is_file()]
     for episode in missing:

@@ -461,7 +461,7 @@ def _finite(text: str) -> float:
     return value
 
 
-_DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
+_DRAFT = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
 
 
 @contextmanager
@@ -469,10 +469,13 @@ def write_atomically(path: Path) -> Iterator[Path]:
     """Yield a draft beside `path`, which becomes `path` in one rename if the block ends well and is
     removed otherwise.
 
+    So are drafts of `path` that killed processes left.
+
     >>> with write_atomically(Path("plan.json")) as draft:
     ...     draft.write_text("{}")
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    remove_drafts(path.parent, path.name)
     draft = draft_of(path)
     try:
         yield draft
@@ -504,11 +507,16 @@ def is_draft(path: Path) -> bool:
     return _DRAFT.fullmatch(path.name) is not None
 
 
-def remove_drafts(folder: Path) -> None:
-    """Remove the drafts in a folder whose writers, processes of this machine, were killed."""
+def remove_drafts(folder: Path, name: str | None = None) -> None:
+    """Remove the drafts in a folder whose writers, processes of this machine, were killed.
+
+    name: of the file that they were to become; None for any.
+    """
     for path in folder.glob(".*.partial"):
         draft = _DRAFT.fullmatch(path.name)
-        if draft is not None and draft["host"] == _host() and not is_alive(int(draft["process"])):
+        if draft is None or draft["host"] != _host() or name not in (None, draft["name"]):
+            continue
+        if not is_alive(int(draft["process"])):
             path.unlink(missing_ok=True)
 
 

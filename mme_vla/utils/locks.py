@@ -12,7 +12,7 @@ from typing import Any, Self
 from filelock import FileLock, Timeout
 
 from mme_vla.errors import UserError
-from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
+from mme_vla.utils.io import is_draft, name_place, read_json, write_json
 
 LOCK = ".lock"
 _ATTEMPTS = 100  # to make and lock a folder that others remove
@@ -118,15 +118,12 @@ def claim_plan(folder: Path, plan: Any) -> bool:
         except UserError:
             pass  # cut off when the machine went down: free, if there is no work yet
         else:
-            if stored == plan:
-                remove_drafts(folder)
             return bool(stored == plan)
     for path in folder.iterdir():
         if path.name in (PLAN, LOCK) or is_draft(path):
             continue
         if not path.is_dir() or any(path.iterdir()):
             return False
-    remove_drafts(folder)
     write_json(record, plan, indent=1)
     return True
 
@@ -153,5 +150,4 @@ def drop_plan(folder: Path, *work: str) -> None:
     for parent in sorted(parents, reverse=True):  # inner ones first
         with suppress(OSError):  # something else lies in it, or it is not there
             (folder / parent).rmdir()
-    remove_drafts(folder)
     (folder / PLAN).unlink(missing_ok=True)

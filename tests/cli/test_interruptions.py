@@ -25,6 +25,7 @@ from mme_vla.utils import (
     draft_of,
     drop_plan,
     remove_drafts,
+    write_atomically,
     write_json,
 )
 
@@ -128,6 +129,19 @@ def test_drafts_of_killed_processes_are_removed_and_those_of_others_are_not(tmp_
         path.touch()
     remove_drafts(tmp_path)
     assert set(tmp_path.iterdir()) == {mine, other_draft}
+
+
+def test_a_file_that_is_written_again_leaves_nothing_of_a_killed_attempt(tmp_path: Path) -> None:
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    mine = draft_of(tmp_path / "page.html")
+    dead = mine.name.replace(f"-{os.getpid()}-", f"-{ended.pid}-")
+    for name in (mine.name, dead, dead.replace("page.html", "other.page.html")):
+        (tmp_path / name).touch()
+    with write_atomically(tmp_path / "page.html") as draft:
+        draft.touch()
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"page.html", mine.name, dead.replace("page.html", "other.page.html")}
 
 
 def test_an_incomplete_plan_is_ignored(tmp_path: Path) -> None:

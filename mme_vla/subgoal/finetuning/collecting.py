@@ -32,7 +32,6 @@ from mme_vla.utils import (
     claim_plan,
     file_sum,
     read_json,
-    remove_drafts,
     to_json,
     write_atomically,
     write_sums,
@@ -113,11 +112,6 @@ def build(
             f"{output} holds something else, or the result of other inputs, sets or options. Choose"
             " another output, repeat that command to finish it, or remove the folder yourself.",
         )
-        # An interrupted run may have left unfinished files.
-        for path in output.rglob("*"):
-            if path.is_dir():
-                remove_drafts(path)
-
         rows_files = {name: output / f"{name}.jsonl" for name in sets}
         if not all(path.is_file() for path in rows_files.values()):
             missing = []

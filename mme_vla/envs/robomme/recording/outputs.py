@@ -17,7 +17,7 @@ from mme_vla.envs.facts import read_facts, write_facts
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.errors import require
-from mme_vla.utils import is_vacant, read_json, remove_drafts, write_atomically
+from mme_vla.utils import is_vacant, read_json, write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
@@ -90,7 +90,6 @@ def join(parts: Sequence[Path], path: Path) -> None:
 
     The file appears under its name only when it is whole.
     """
-    remove_drafts(path.parent)
     with write_atomically(path) as draft, h5py.File(draft, "w") as target:
         for part in parts:
             with h5py.File(part) as source:
