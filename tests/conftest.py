@@ -25,11 +25,21 @@ def _folder(variable: str, default: Path, what: str) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _isolated_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forget the plugins that a test imports when it ends."""
+def _isolated_plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Forget the plugins that a test imports and the parts that it registers when it ends.
+
+    What the library's own modules register meanwhile stays: they are imported only once.
+    """
     from mme_vla.config import plugins
+    from mme_vla.registry import REGISTRIES
 
     monkeypatch.setattr(plugins, "_imported", dict(plugins._imported))
+    before = {kind: set(registry._entries) for kind, registry in REGISTRIES.items()}
+    yield
+    for kind, registry in REGISTRIES.items():
+        for name in registry._entries.keys() - before[kind]:
+            if registry._entries[name].__module__.rpartition(".")[2].startswith("test_"):
+                del registry._entries[name]
 
 
 @pytest.fixture(autouse=True)

@@ -72,12 +72,10 @@ def test_an_option_that_is_passed_on_is_named_where_no_constructor_takes_it() ->
 
 
 def test_an_error_says_that_leftover_options_are_of_the_file() -> None:
-    if "only_budget" not in REGISTRIES["memory"]:
-
-        @register("memory", "only_budget")
-        class OnlyBudget(Memory):
-            def __init__(self, d_vision: int, width: int, budget: int = 4) -> None:
-                super().__init__()
+    @register("memory", "only_budget")
+    class OnlyBudget(Memory):
+        def __init__(self, d_vision: int, width: int, budget: int = 4) -> None:
+            super().__init__()
 
     with pytest.raises(UserError, match=r"is of the section's file.* memory=….*~memory\."):
         build_policy("framesamp_modul", device="meta", memory={"name": "only_budget"})

@@ -226,9 +226,9 @@ def of_a_plugin(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(plugins, "_imported", {})
-    monkeypatch.setattr(registry.ENVS, "_entries", dict(registry.ENVS._entries))
     yield tmp_path
     sys.modules.pop("foreign_env", None)
+    registry.ENVS._entries.pop("of_a_plugin", None)
 
 
 def test_an_environment_of_a_plugin_is_verified_with_its_module(of_a_plugin: Path) -> None:

@@ -109,11 +109,8 @@ def test_entries_that_are_no_transforms_are_reported() -> None:
 
 def test_what_is_no_perturbation_is_refused_by_name() -> None:
     register("perturbation", "a_function")(lambda: None)
-    try:
-        with pytest.raises(UserError, match="a_function must be a class that derives from"):
-            build_transforms(["a_function"])
-    finally:
-        del PERTURBATIONS._entries["a_function"]
+    with pytest.raises(UserError, match="a_function must be a class that derives from"):
+        build_transforms(["a_function"])
 
 
 def test_a_pause_is_written_by_the_name_that_a_probe_was_given() -> None:

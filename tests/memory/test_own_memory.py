@@ -23,7 +23,6 @@ from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop
-from mme_vla.registry import MEMORIES
 from mme_vla.testing import check_memory
 from mme_vla.testing.small import moving_frames, open_gates, random_batch, unit_stats
 from mme_vla.types import FrameBatch
@@ -84,7 +83,6 @@ def rules(monkeypatch, tmp_path):
     (block,) = (b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Contrast" in b)
     (tmp_path / "rules.py").write_text(block)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(MEMORIES, "_entries", dict(MEMORIES._entries))
     yield importlib.import_module("rules")
     del sys.modules["rules"]
 
@@ -147,8 +145,7 @@ def test_a_selection_with_a_patch_twice_fails_the_check(rules, monkeypatch):
         ("__init__", lambda memory, d_vision, width, **_: Memory.__init__(memory), "no budget"),
     ],
 )
-def test_a_mistake_is_named_by_the_check(monkeypatch, method, replacement, message):
-    monkeypatch.setattr(MEMORIES, "_entries", dict(MEMORIES._entries))
+def test_a_mistake_is_named_by_the_check(method, replacement, message):
     register("memory", "mistaken")(type("Mistaken", (FrameSamp,), {method: replacement}))
     with pytest.raises(AssertionError, match=message):
         check_memory("mistaken", budget=16)
@@ -178,8 +175,7 @@ def test_what_is_no_memory_tokens_is_refused_in_training_and_in_an_episode(polic
         policy.act([episode])
 
 
-def test_a_constructor_without_the_widths_is_named(monkeypatch):
-    monkeypatch.setattr(MEMORIES, "_entries", dict(MEMORIES._entries))
+def test_a_constructor_without_the_widths_is_named():
     register("memory", "mistaken")(lambda budget=16: FrameSamp(32, 48, budget))
     with pytest.raises(UserError, match="its constructor must take d_vision and width"):
         check_memory("mistaken")
