@@ -212,8 +212,7 @@ def receipt(
     }
 
     def write(ended: bool) -> None:
-        done = read_records(records) if records.exists() else []
-        score = _score(records, done, run["settings"])
+        score = _score(records, read_records(records), run["settings"])
         write_json(path, with_checksum(to_json(facts | score | {"ended": ended})))
 
     write(ended=False)  # a process that is killed has named its conditions
@@ -222,7 +221,8 @@ def receipt(
     finally:
         if policy.info.server is not None:
             here["server"] = dict(policy.info.server)  # its times are known now
-        write(ended=True)
+        if records.exists():  # nobody has removed the run's folder
+            write(ended=True)
 
 
 def read_receipt(path: Path) -> dict[str, Any]:

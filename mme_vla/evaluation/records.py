@@ -286,7 +286,16 @@ class RecordLog:
             raise
 
     def append(self, record: EpisodeRecord) -> None:
-        """Write one record."""
+        """Write one record.
+
+        Raises:
+            UserError: the file is no longer there, so that nobody would find the record.
+        """
+        require(
+            self.path.exists(),
+            f"{self.path} was removed or moved while this run was writing to it: leave it there,"
+            " and repeat the same command.",
+        )
         self._file.write(record.to_json().encode() + b"\n")
         self._file.flush()
         os.fsync(self._file.fileno())

@@ -1,5 +1,6 @@
 """A whole run: killed and gone on with, dying workers, shards, videos, the command."""
 
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -22,7 +23,7 @@ from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError
 from mme_vla.evaluation.claims import Claims, Shard, choose_shard
-from mme_vla.evaluation.records import EpisodeRecord, RunKey
+from mme_vla.evaluation.records import EpisodeRecord, RecordLog, RunKey
 from mme_vla.evaluation.rollout.environment import Report
 from mme_vla.evaluation.rollout.evaluation import EvaluationRun, RunOptions, default_output
 from mme_vla.evaluation.rollout.progress import RolloutProgress
@@ -74,6 +75,24 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(
     assert len(after) == len(resumed.records) == 6
     assert outcomes(folder) == outcomes(tmp_path / "whole")
     assert run_evaluation(policy, folder).workload.batches == 0, "nothing was left to do"
+
+
+def test_a_run_whose_folder_is_removed_ends_at_once_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_inline_envs(monkeypatch)
+    folder, append = tmp_path / "run", RecordLog.append
+
+    def append_to_nothing(log: RecordLog, record: EpisodeRecord) -> None:
+        shutil.rmtree(folder)
+        append(log, record)
+
+    monkeypatch.setattr(RecordLog, "append", append_to_nothing)
+    with pytest.raises(UserError, match=r"episodes\.jsonl was removed or moved while this run"):
+        run_evaluation(quick_policy("pi05"), folder, jobs=JOBS[:1])
+    assert not folder.exists()
+    monkeypatch.setattr(RecordLog, "append", append)
+    assert len(run_evaluation(quick_policy("pi05"), folder, jobs=JOBS[:1]).records) == 1
 
 
 def test_a_dying_worker_is_an_error_that_is_tried_again(
