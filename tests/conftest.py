@@ -43,18 +43,25 @@ def _isolated_plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _open_log_streams() -> Iterator[None]:
-    """Point log handlers away from the captured streams that a test closes when it ends: a later
-    test would print "Logging error" where they write.
+def _loggers_as_before() -> Iterator[None]:
+    """Put the library's loggers and the root logger back when a test ends, and point log handlers
+    away from the captured streams that it closes: a later test would print "Logging error" where
+    they write.
 
     Hydra, `log_to_terminal` and packages that a test is the first to import leave such handlers.
+    `log_to_terminal` also keeps a logger's records from `caplog`.
     """
     root = logging.root
     level = root.level
     yield
     root.setLevel(level)
-    for logger in [root, *root.manager.loggerDict.values()]:
-        for handler in getattr(logger, "handlers", ()):  # a placeholder has none
+    for name, logger in [("", root), *root.manager.loggerDict.items()]:
+        if not isinstance(logger, logging.Logger):
+            continue
+        if name.startswith("mme_vla"):
+            logger.handlers, logger.propagate = [], True
+            logger.setLevel(logging.NOTSET)
+        for handler in logger.handlers:
             if type(handler) is logging.StreamHandler and handler.stream.closed:
                 handler.stream = sys.stderr  # `setStream` would flush the closed one
 
