@@ -42,6 +42,7 @@ class FolderLock:
         self._lock = FileLock(
             self.path, timeout=0.1, poll_interval=0.02, thread_local=False, fallback_to_soft=False
         )
+        self._inode: int | None = None  # of the folder that is locked
 
     def acquire(self) -> Self:
         """Lock the folder; raises an error that names the process which has locked it."""
@@ -49,6 +50,7 @@ class FolderLock:
             self.folder.mkdir(parents=True, exist_ok=True)
             try:
                 self._lock.acquire()
+                self._inode = self.folder.stat().st_ino
                 break
             except FileNotFoundError:  # the process before has just removed the folder
                 if attempt == _ATTEMPTS - 1:
@@ -93,7 +95,16 @@ class FolderLock:
         trace: TracebackType | None,
     ) -> None:
         name_place(error, self.folder)
+        inode: int | None = None
+        with suppress(OSError):
+            inode = self.folder.stat().st_ino
         self.release()
+        is_same = self._inode in (None, inode)
+        if not is_same and isinstance(error, FileNotFoundError | None):
+            raise UserError(
+                f"{self.folder} was removed or moved while this {self.what} was writing to it, so"
+                " files are missing. Remove what is there now, and repeat the same command."
+            ) from error
 
 
 PLAN = "plan.json"

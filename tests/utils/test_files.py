@@ -236,6 +236,29 @@ os._exit(0)
 """
 
 
+@pytest.mark.parametrize("is_made_again", [False, True])
+@pytest.mark.parametrize("error", [None, FileNotFoundError("missing")])
+def test_a_folder_that_is_removed_during_the_work_is_named(
+    is_made_again: bool, error: Exception | None, tmp_path: Path
+) -> None:
+    folder = tmp_path / "cache"
+    with (
+        pytest.raises(UserError, match=r"cache was removed or moved while this build was writing"),
+        FolderLock(folder, "build"),
+    ):
+        folder.rename(tmp_path / "elsewhere")
+        if is_made_again:
+            folder.mkdir()
+        if error is not None:
+            raise error
+
+
+def test_another_error_than_of_a_removed_folder_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), FolderLock(tmp_path / "cache"):
+        (tmp_path / "cache").rename(tmp_path / "elsewhere")
+        raise KeyboardInterrupt
+
+
 def test_forked_process_does_not_keep_the_lock(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", FORK, tmp_path], stdout=subprocess.PIPE, text=True, check=True
