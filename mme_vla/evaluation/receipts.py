@@ -221,7 +221,7 @@ def receipt(
     finally:
         if policy.info.server is not None:
             here["server"] = dict(policy.info.server)  # its times are known now
-        if records.exists():  # nobody has removed the run's folder
+        if records.exists():  # the run's folder may have been removed
             write(ended=True)
 
 

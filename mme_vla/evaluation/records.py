@@ -289,7 +289,7 @@ class RecordLog:
         """Write one record.
 
         Raises:
-            UserError: the file is no longer there, so that nobody would find the record.
+            UserError: the file is no longer there, so that the record would be lost.
         """
         require(
             self.path.exists(),

@@ -30,7 +30,7 @@ def keep_compiled_code() -> Path:
     from torch._inductor import config
     from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
-    # Where nobody set it, that import sets it: to a folder among the temporary ones of all users.
+    # Where it is not set, that import sets it: to a folder among the temporary ones of all users.
     if os.environ.get(CACHE_VARIABLE, default_cache_dir()) == default_cache_dir():
         folder = user_cache("compiled")
         folder.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ Checks happen when a file is opened; what a reader returns is trusted from then 
 """
 
 import errno
+import glob
 import json
 import lzma
 import math
@@ -461,7 +462,7 @@ def _finite(text: str) -> float:
     return value
 
 
-_DRAFT = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
+_DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
 
 
 @contextmanager
@@ -475,7 +476,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
     ...     draft.write_text("{}")
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    remove_drafts(path.parent, path.name)
+    remove_drafts(path.parent, glob.escape(path.name))
     draft = draft_of(path)
     try:
         yield draft
@@ -507,16 +508,14 @@ def is_draft(path: Path) -> bool:
     return _DRAFT.fullmatch(path.name) is not None
 
 
-def remove_drafts(folder: Path, name: str | None = None) -> None:
+def remove_drafts(folder: Path, file: str = "*") -> None:
     """Remove the drafts in a folder whose writers, processes of this machine, were killed.
 
-    name: of the file that they were to become; None for any.
+    file: what they were to become, a pattern.
     """
-    for path in folder.glob(".*.partial"):
+    for path in folder.glob(f".{file}.*.partial"):
         draft = _DRAFT.fullmatch(path.name)
-        if draft is None or draft["host"] != _host() or name not in (None, draft["name"]):
-            continue
-        if not is_alive(int(draft["process"])):
+        if draft is not None and draft["host"] == _host() and not is_alive(int(draft["process"])):
             path.unlink(missing_ok=True)
 
 

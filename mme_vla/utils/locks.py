@@ -95,11 +95,10 @@ class FolderLock:
         trace: TracebackType | None,
     ) -> None:
         name_place(error, self.folder)
-        inode: int | None = None
-        with suppress(OSError):
-            inode = self.folder.stat().st_ino
+        is_same = self._inode is None or (
+            self.folder.exists() and self.folder.stat().st_ino == self._inode
+        )
         self.release()
-        is_same = self._inode in (None, inode)
         if not is_same and isinstance(error, FileNotFoundError | None):
             raise UserError(
                 f"{self.folder} was removed or moved while this {self.what} was writing to it, so"

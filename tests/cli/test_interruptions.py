@@ -131,7 +131,7 @@ def test_drafts_of_killed_processes_are_removed_and_those_of_others_are_not(tmp_
     assert set(tmp_path.iterdir()) == {mine, other_draft}
 
 
-def test_a_file_that_is_written_again_leaves_nothing_of_a_killed_attempt(tmp_path: Path) -> None:
+def test_a_second_attempt_at_a_file_removes_the_draft_of_a_killed_one(tmp_path: Path) -> None:
     ended = subprocess.Popen(["true"])
     ended.wait()
     mine = draft_of(tmp_path / "page.html")

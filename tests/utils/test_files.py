@@ -253,7 +253,7 @@ def test_a_folder_that_is_removed_during_the_work_is_named(
             raise error
 
 
-def test_another_error_than_of_a_removed_folder_is_kept(tmp_path: Path) -> None:
+def test_another_error_than_of_a_removed_folder_passes(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), FolderLock(tmp_path / "cache"):
         (tmp_path / "cache").rename(tmp_path / "elsewhere")
         raise KeyboardInterrupt
