@@ -286,15 +286,10 @@ class RecordLog:
             raise
 
     def append(self, record: EpisodeRecord) -> None:
-        """Write one record.
-
-        Raises:
-            UserError: the file is no longer there, so that the record would be lost.
-        """
+        """Write one record, if the file is still there."""
         require(
             self.path.exists(),
-            f"{self.path} was removed or moved while this run was writing to it: leave it there,"
-            " and repeat the same command.",
+            f"{self.path} was removed or moved: leave it there, and repeat the same command.",
         )
         self._file.write(record.to_json().encode() + b"\n")
         self._file.flush()
