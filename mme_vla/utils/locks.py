@@ -50,7 +50,6 @@ class FolderLock:
             self.folder.mkdir(parents=True, exist_ok=True)
             try:
                 self._lock.acquire()
-                self._inode = self.folder.stat().st_ino
                 break
             except FileNotFoundError:  # the process before has just removed the folder
                 if attempt == _ATTEMPTS - 1:
@@ -70,6 +69,7 @@ class FolderLock:
                 if error.errno not in _NO_LOCKS:
                     raise
                 return self
+        self._inode = self.folder.stat().st_ino
         with suppress(OSError):  # a full disk: the lock holds without its text
             self.path.write_text(
                 f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8"

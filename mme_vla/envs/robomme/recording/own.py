@@ -186,8 +186,8 @@ def _stack(env: EpisodeEnv, name: str, values: Sequence[np.ndarray]) -> np.ndarr
     is_finite = np.isfinite(column).reshape(len(column), -1).all(1)
     require(
         is_finite.all(),
-        f"{env.spec.task}, episode {env.spec.episode}: {name} has numbers that are not finite, first"
-        f" in frame {is_finite.argmin()}.",
+        f"{env.spec.task}, episode {env.spec.episode}: {name} has numbers that are not finite,"
+        f" first in frame {is_finite.argmin()}.",
     )
     return column
 
