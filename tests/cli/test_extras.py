@@ -138,7 +138,7 @@ SUFFICE = [
     Case(
         ("sim",),
         "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown",
-        "1 task",
+        "shown/README.md: 1 episode",
         draws=True,
     ),
     Case(("sim",), f"{PLAY} player=random", "records:"),
