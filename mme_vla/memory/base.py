@@ -171,12 +171,17 @@ class MemoryModule(nn.Module):
                 " that the history has seen."
             )
         indices = np.asarray(self.select(history, step, rng))
+        features = history.gather(indices)
         if len(indices) > self.capacity:
-            raise ValueError(
+            raise UserError(
                 f"{type(self).__name__}.select returned {len(indices)} tokens; at most"
                 f" {self.capacity}, its capacity."
             )
-        features = history.gather(indices)
+        if (indices[:, 0] > step).any():
+            raise UserError(
+                f"{type(self).__name__}.select returned frame {indices[:, 0].max()} at step {step};"
+                " expected none later than the step, which no episode has seen then."
+            )
         device = features.device
         positions = torch.from_numpy(token_positions(history.timed(indices), self.storage.grid))
         # Made on the device: nothing waits for a copy.

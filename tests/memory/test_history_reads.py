@@ -126,3 +126,21 @@ def test_a_memory_that_chooses_by_scores_gets_no_history_without() -> None:
     cached = CachedHistory(memory.storage, TOKENS[stored].numpy(), stored, FRAMES, scores)
     for history in (online, cached):
         assert memory.gather_selection(history, 9).mask.sum() == 8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("selected", "words"),
+    [
+        ([[5, 0]], r"FrameSamp\.select returned frame 5 at step 4; expected none later"),
+        ([[0, 0]] * 5, r"FrameSamp\.select returned 5 tokens; at most 4, its capacity"),
+        (None, r"whole numbers \[n, 2\], each row a frame and a patch .* got object \[\]: None"),
+    ],
+)
+def test_a_selection_is_of_frames_until_the_step_and_fits_the_capacity(
+    kind: str, selected: Any, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = FrameSamp(8, 8, budget=4, grid=2)
+    monkeypatch.setattr(memory, "select", lambda history, step, rng=None: selected)
+    with pytest.raises(UserError, match=words):
+        memory.gather_selection(history_of(kind), 4)
