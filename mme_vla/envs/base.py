@@ -27,7 +27,7 @@ from mme_vla.envs.facts import Candidates, Fact
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec, numbered
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
-from mme_vla.errors import UserError, check_known, listed, require
+from mme_vla.errors import UserError, brief, check_known, listed, require
 from mme_vla.registry import ENVS
 
 Actions = Iterable[Any]
@@ -267,6 +267,10 @@ class Environment(ABC):
             env = _idle.pop((type(self), task, render), None)
         if env is None:
             env = self.make(spec, render)
+        require(
+            hasattr(env, "reset") and not isinstance(env, type),
+            f"{type(self).__name__}.make returned {brief(env)}; expected a gymnasium.Env.",
+        )
         return EpisodeEnv(self, env, spec, max_steps, action_space == CHOICES, render)
 
 
@@ -506,6 +510,11 @@ class EpisodeEnv:
         """An observation with its images: those that are functions are rendered now, or left
         out where they were not requested.
         """
+        require(
+            isinstance(observation, Mapping),
+            f"{self.spec.task}: an observation is a {type(observation).__name__}; expected a dict"
+            " of an image for each camera, and 'state'.",
+        )
         frame: dict[str, Any] = {}
         requested = self.render_request
         for name, value in observation.items():
@@ -525,12 +534,12 @@ class EpisodeEnv:
                 " [H, W, 3], or a function that renders it), or open it with render=False.",
             )
             self._names = set(frame)
-        place = f"{self.spec.task}: frame {self._frames} of the episode"
-        remedy = "Give the same cameras and the state in every observation."
-        missing = sorted(self._names - set(frame))
-        require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
-        added = sorted(set(frame) - self._names)
-        require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
+        require(
+            set(frame) == self._names,
+            f"{self.spec.task}: frame {self._frames} of the episode has"
+            f" {listed(sorted(frame))}, and frame 0 has {listed(sorted(self._names))}. Give the"
+            " same cameras and the state in every observation.",
+        )
         self._frames += 1
         return frame
 

@@ -100,6 +100,22 @@ def test_a_closed_episode_says_so() -> None:
         env.reset()
 
 
+@pytest.mark.parametrize("made", [None, Tape])
+def test_what_is_no_environment_is_refused_where_it_is_made(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Tapes, "make", lambda self, spec, render=True: made)
+    with pytest.raises(UserError, match=r"Tapes\.make returned .*; expected a gymnasium\.Env\."):
+        opened()
+
+
+@pytest.mark.parametrize("observation", [np.zeros(3, np.float32), None, ({}, {})])
+def test_an_observation_is_a_dict(observation: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Tape, "observe", lambda self: observation)
+    with pytest.raises(UserError, match=r"Tape: an observation is a \w+; expected a dict of an im"):
+        opened().reset()
+
+
 def test_a_demonstration_may_be_a_list_of_actions() -> None:
     env = opened()
     times = [frame["state"].item() for frame, _, _ in env.demonstration()]

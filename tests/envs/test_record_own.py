@@ -145,6 +145,14 @@ def _gray_image(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any
     return {**frame, "top": frame["top"][..., 0]}
 
 
+def _float_image(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {**frame, "top": frame["top"] / 255}
+
+
+def _channels_first(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
+    return {**frame, "top": frame["top"].transpose(2, 0, 1)}
+
+
 def _other_camera(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any]:
     return {"side": frame["top"], "state": frame["state"]}
 
@@ -163,8 +171,10 @@ def _lost_state(episode: int, time: int, frame: dict[str, Any]) -> dict[str, Any
         (_lost_state, r"episode 0: observation\.state has numbers that are not .* in frame 6\."),
         (_second_camera, r"Blink, episode 1: a frame has .*images\.wrist.* as in the episodes bef"),
         (_larger_image, r"Blink, episode 1: a frame has .*images\.top \[65, 64, 3\]"),
-        (_growing_image, r"Blink, episode 0: observation\.images\.top has the shape \(64, "),
-        (_gray_image, r"images\.top has the shape \(64, 64\); expected one with 3 numbers"),
+        (_growing_image, r"top is uint8 \[64, 64, 3\] and uint8 \[65, 64, 3\]; expected"),
+        (_gray_image, r"images\.top is uint8 \[64, 64\]; expected an image as uint8 \[H, "),
+        (_float_image, r"images\.top is float64 \[64, 64, 3\]; expected an image as uint8 \[H, "),
+        (_channels_first, r"Blink, episode 0: .*top is uint8 \[3, 64, 64\]; expected an im"),
         (_other_camera, r"images\.side .* embodiment names the cameras top, 1 numbers of state"),
         (_wider_state, r"state \[2\], and embodiment names the cameras top, 1 numbers of state"),
     ],

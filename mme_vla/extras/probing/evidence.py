@@ -89,9 +89,8 @@ def _record_demonstration(
     video = 0
     try:
         for frame, _, in_video in env.demonstration():
-            image = frame[camera]
-            if image is not None and len(states) in rendered:
-                images[len(states)] = image
+            if len(states) in rendered:  # without any, the environment may give no images at all
+                images[len(states)] = frame[camera]
             states.append(np.asarray(frame["state"], np.float32))
             video += in_video
         all_facts = env.facts

@@ -5,6 +5,7 @@ chance on tasks.
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,6 +228,20 @@ def test_an_environment_of_ones_own_has_scores_from_its_facts(
     assert episode is not None and episode.facts[0].needed == (4,)
     assert (episode.exec_start, sorted(episode.images)) == (4, [0, 2])
     assert episode.states.shape == (episode.length, 1) and episode.images[0].shape == (64, 64, 3)
+
+    # An environment may leave images out where none is read.
+    kind = type(environment("blink"))
+    make = kind.make
+
+    def blind(self: Any, spec: Any, render: bool = True) -> Any:
+        env = make(self, spec, render)
+        env.observe = lambda light=False: {"state": np.array([env.arm], np.float32)}
+        return env
+
+    with monkeypatch.context() as changes:
+        changes.setattr(kind, "make", blind)
+        unseen = record_evidence(spec, env="blink")
+    assert unseen is not None and unseen.facts == episode.facts and not unseen.images
 
     # Frames that no policy sees: those after the last action.
     late = [Fact("light", "left", (0, 99), (4, 99)), Fact("end", "x", (99, 99))]

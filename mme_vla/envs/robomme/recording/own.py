@@ -175,12 +175,12 @@ def _by_motions(env: EpisodeEnv) -> dict[str, np.ndarray]:
 def _stack(env: EpisodeEnv, name: str, values: Sequence[np.ndarray]) -> np.ndarray:
     """The column of an episode, from its frames' values."""
     n_axes = 3 if name.startswith(IMAGES) else 1
-    shapes = sorted({value.shape for value in values})
+    is_image = values[0].dtype == np.uint8 and values[0].shape[2:] == (3,)
+    forms = sorted({f"{value.dtype} {list(value.shape)}" for value in values})
     require(
-        len(shapes) == 1 and len(shapes[0]) == n_axes,
-        f"{env.spec.task}, episode {env.spec.episode}: {name} has the shape"
-        f" {' and '.join(map(str, shapes))}; expected one with {counted(n_axes, 'number')}, in"
-        " every frame the same.",
+        len(forms) == 1 and values[0].ndim == n_axes and (n_axes == 1 or is_image),
+        f"{env.spec.task}, episode {env.spec.episode}: {name} is {' and '.join(forms)}; expected an"
+        " image as uint8 [H, W, 3], or other numbers as [n], in every frame the same.",
     )
     column = np.stack(values)
     is_finite = np.isfinite(column).reshape(len(column), -1).all(1)
