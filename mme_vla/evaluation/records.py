@@ -287,10 +287,7 @@ class RecordLog:
 
     def append(self, record: EpisodeRecord) -> None:
         """Write one record, if the file is still there."""
-        require(
-            self.path.exists(),
-            f"{self.path} was removed or moved: leave it there, and repeat the same command.",
-        )
+        require(self.path.exists(), f"{self.path} was removed or moved: repeat the same command.")
         self._file.write(record.to_json().encode() + b"\n")
         self._file.flush()
         os.fsync(self._file.fileno())

@@ -40,7 +40,7 @@ def test_the_page_on_the_layout_has_the_counted_numbers() -> None:
         ),
         (
             reading_paths.EPISODE,
-            555,
+            550,
             [
                 ("evaluation/rollout/evaluation.py", "EvaluationRun.run"),
                 ("envs/vector/pool.py", "serve"),

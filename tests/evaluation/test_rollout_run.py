@@ -88,7 +88,7 @@ def test_a_run_whose_folder_is_removed_ends_at_once_and_leaves_nothing(
         append(log, record)
 
     monkeypatch.setattr(RecordLog, "append", append_to_nothing)
-    with pytest.raises(UserError, match=r"episodes\.jsonl was removed or moved: leave it there"):
+    with pytest.raises(UserError, match=r"episodes\.jsonl was removed or moved: repeat the same"):
         run_evaluation(quick_policy("pi05"), folder, jobs=JOBS[:1])
     assert not folder.exists()
     monkeypatch.setattr(RecordLog, "append", append)

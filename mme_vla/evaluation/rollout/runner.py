@@ -112,7 +112,6 @@ class Rollout:
         robot = self.policy.embodiment
         source = environment(self.settings.env)
         spec = source.episode(job.task, job.split, job.episode)
-        failed = outcome == "error"
         record = EpisodeRecord(
             **self.facts._asdict(),
             max_steps=self.settings.limit_of(job.task),
@@ -125,7 +124,7 @@ class Rollout:
             outcome=outcome,
             steps=running.steps,
             seconds=running.seconds,
-            error=reason if failed else None,
+            error=reason if outcome == "error" else None,
             env=self.settings.env,
             goal=running.episode.goal,
             chunks=running.chunks,
@@ -133,7 +132,7 @@ class Rollout:
             actions_sha256=running.actions_sha256,
             suite=source.suite_of(job.task),
             groups=source.groups_of(job.task) or None,
-            refused=None if failed else reason,
+            refused=reason if outcome != "error" else None,
             video=running.report.video,
             process=running.report.process,
             events=tuple(running.events.log),
