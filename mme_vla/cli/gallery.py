@@ -16,7 +16,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import SceneError, UserError, counted, require
-from mme_vla.utils import read_text
+from mme_vla.utils import read_text, write_text
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
 from mme_vla.utils.pages import render
 
@@ -95,7 +95,7 @@ def main(cfg: DictConfig) -> None:
             advance(1)
     names = list(dict.fromkeys(task for task, _, _ in entries))
     title = counted(len(names), "task") if len(names) > 1 else names[0]
-    page.write_text(render("gallery.md", title=title, entries=entries), encoding="utf-8")
+    write_text(page, render("gallery.md", title=title, entries=entries))
     print(f"{page}: {counted(len(entries), 'episode')}.")
 
 

@@ -69,7 +69,7 @@ from mme_vla.evaluation.results.tables import (
 )
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import files_below, find_records, read_folders
-from mme_vla.utils import require_replaceable
+from mme_vla.utils import require_replaceable, write_text
 from mme_vla.utils.pages import escape_markdown, render
 
 DEMO = (
@@ -329,8 +329,7 @@ def show_view(view: str, records: Sequence[EpisodeRecord], args: argparse.Namesp
 
 def _write(texts: dict[Path, str]) -> None:
     for path, text in texts.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        write_text(path, text)
 
 
 def write(results: Results, comparisons: list[Comparison], args: argparse.Namespace) -> list[Path]:

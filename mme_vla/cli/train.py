@@ -45,7 +45,7 @@ from mme_vla.training.runs import (
     weights_to_start_from,
 )
 from mme_vla.training.settings import TrainRun
-from mme_vla.utils import started_processes, write_atomically
+from mme_vla.utils import started_processes, write_text
 
 
 def main(cfg: DictConfig) -> None:
@@ -220,8 +220,7 @@ def _train(
     loggers = Loggers()
     if first:
         loggers = open_loggers(place.folder, saved_config, place.step, run.logger)
-        with write_atomically(place.folder / CONFIG) as draft:
-            OmegaConf.save(OmegaConf.create(config), draft)
+        write_text(place.folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
     with closing(loggers):
         with line:
             finished = trainer.run(line, loggers)

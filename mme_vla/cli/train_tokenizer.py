@@ -15,6 +15,7 @@ from pathlib import Path
 
 from mme_vla.cli.help import argument_parser
 from mme_vla.errors import UserError, require
+from mme_vla.utils import write_atomically
 
 VOCAB_SIZE = 1024
 
@@ -79,6 +80,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{path} exists, and is another tokenizer, which a checkpoint or a training may need:"
         " choose another folder, or remove it yourself.",
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
+    with write_atomically(path) as draft:
+        draft.write_bytes(content)
     print(f"Wrote {path} ({VOCAB_SIZE} pieces).")

@@ -36,7 +36,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import score_frame
-from mme_vla.utils import sum_line, write_atomically, write_json
+from mme_vla.utils import sum_line, write_atomically, write_json, write_text
 
 PAGE = 4096  # bytes
 CHUNKS_AHEAD = 2
@@ -230,8 +230,7 @@ def _build_episode(
             _flush(file)
         sums += sum_line(draft, path.name)
         # Tokens come last: where they are, all else is.
-        with write_atomically(sum_file(folder, episode)) as sum_draft:
-            sum_draft.write_text(sums, encoding="utf-8")
+        write_text(sum_file(folder, episode), sums)
 
 
 def _flush(file: IO[bytes]) -> None:

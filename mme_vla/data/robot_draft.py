@@ -9,6 +9,7 @@ from pathlib import Path
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.lerobot_files import Feature, Info, names_of
 from mme_vla.errors import listed, printable, require
+from mme_vla.utils import write_text
 
 CHECK = "check:"
 """Begins the comments of lines that a dataset cannot tell."""
@@ -189,6 +190,5 @@ def save_draft(draft: RobotDraft, folder: Path) -> tuple[Path, bool]:
     path = folder / "embodiment" / f"{draft.name}.yaml"
     if path.exists():
         return path, False
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(draft.text, encoding="utf-8")
+    write_text(path, draft.text)
     return path, True

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mme_vla.errors import UserError, require
-from mme_vla.utils import user_cache, write_atomically
+from mme_vla.utils import user_cache, write_text
 
 if TYPE_CHECKING:
     import sapien
@@ -164,8 +164,7 @@ def _pipeline_folder() -> Path | None:
     caches = user_cache("shaders") / key
     for name, text in lean.items():
         if not (caches / name).is_file():
-            with write_atomically(caches / name) as draft:
-                draft.write_text(text, encoding="utf-8")
+            write_text(caches / name, text)
     return caches / PACK
 
 

@@ -30,7 +30,7 @@ from mme_vla.data.console import Bar
 from mme_vla.errors import CONSTRAINTS, UserError, missing_extra, require
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
-from mme_vla.utils import read_lines, write_atomically
+from mme_vla.utils import read_lines, write_text
 
 
 class Window:
@@ -232,8 +232,7 @@ def _run_id(folder: Path) -> str:
     """The tracker's id of this run, made once."""
     record = folder / "wandb_id"
     if not record.is_file():
-        with write_atomically(record) as draft:
-            draft.write_text(secrets.token_hex(4), encoding="utf-8")
+        write_text(record, secrets.token_hex(4))
     return record.read_text(encoding="utf-8")
 
 
@@ -302,11 +301,9 @@ def open_loggers(
         tracker = LOGGERS.build(section, folder, config, first_step=first_step)
         tracker.start()
         if isinstance(tracker, MLflowTracker):
-            with write_atomically(folder / "mlflow_id") as draft:
-                draft.write_text(tracker.tracker.info.run_id, encoding="utf-8")
+            write_text(folder / "mlflow_id", tracker.tracker.info.run_id)
     lines = [line for line in read_metrics(folder) if line["step"] <= first_step]
-    with write_atomically(folder / METRICS) as draft:
-        draft.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    write_text(folder / METRICS, "".join(json.dumps(line) + "\n" for line in lines))
     return Loggers((folder / METRICS).open("a", buffering=1, encoding="utf-8"), tracker)
 
 

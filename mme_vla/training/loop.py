@@ -16,6 +16,8 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.recording import Recording
 from mme_vla.errors import UserError, require
 from mme_vla.policy.base import Policy
+from mme_vla.policy.saving import read_config
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.self_check import SelfCheck, try_self_check
 from mme_vla.speed import Recomputes
 from mme_vla.speed.compiler import keep_compiled_code, missing_compiler
@@ -53,7 +55,7 @@ from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
 from mme_vla.training.stopping import leave_signals_alone, stop_requests
 from mme_vla.types import send
-from mme_vla.utils import write_atomically
+from mme_vla.utils import write_text
 
 
 class _InEpoch(Dataset[Any]):
@@ -131,6 +133,10 @@ class Trainer:
         self.ema = EMA(parameters, settings.ema, settings.ema_warmup, partial(reshard, policy))
         if run.checkpoint is not None:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
+            # The card keeps the last validation's loss until the next one.
+            card = PolicySections.of(read_config(run.checkpoint)).card
+            if "results" in card:
+                self.facts["card"] = {**self.facts.get("card", {}), "results": card["results"]}
         # What an update calls: sharded weights exchange gradients themselves, others through DDP.
         self._replicated = policy if self.sharded else accelerator.prepare_model(policy)
         # What a CPU takes for it was not measured.
@@ -388,8 +394,8 @@ def finish(
         line.say(advice)
         line.say(f"plot: {folder / PLOT}")
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
-    with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
-        draft.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    # a run that has one is finished
+    write_text(folder / SUMMARY, json.dumps(summary, indent=2) + "\n")
     line.say(
         f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (means of the updates that"
         " were logged first and last)"

@@ -38,6 +38,7 @@ from mme_vla.utils.io import (
     with_checksum,
     write_atomically,
     write_json,
+    write_text,
 )
 from mme_vla.utils.locks import PLAN, FolderLock, claim_plan, drop_plan
 from mme_vla.utils.processes import files_to_hold, started_processes
@@ -82,4 +83,5 @@ __all__ = [
     "write_atomically",
     "write_json",
     "write_sums",
+    "write_text",
 ]

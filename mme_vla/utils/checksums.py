@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mme_vla.errors import UserError, listed, require
-from mme_vla.utils.io import inside, read_text, write_atomically
+from mme_vla.utils.io import inside, read_text, write_text
 
 SUMS = "SHA256SUMS"
 _AT_ONCE = 4  # files
@@ -44,10 +44,7 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
     with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
         sums = pool.map(lambda name: file_sum(folder / name), files)
         table.update(zip(files, sums, strict=True))
-    with write_atomically(folder / SUMS) as draft:
-        draft.write_text(
-            "".join(f"{table[name]}  {name}\n" for name in sorted(table)), encoding="utf-8"
-        )
+    write_text(folder / SUMS, "".join(f"{table[name]}  {name}\n" for name in sorted(table)))
 
 
 class Sums:

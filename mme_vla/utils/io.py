@@ -470,11 +470,14 @@ def write_atomically(path: Path) -> Iterator[Path]:
     """Yield a draft beside `path`, which becomes `path` in one rename if the block ends well and is
     removed otherwise.
 
-    So are drafts of `path` that killed processes left.
+    So are drafts of `path` that killed processes left. A device or a pipe is written itself.
 
     >>> with write_atomically(Path("plan.json")) as draft:
     ...     draft.write_text("{}")
     """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        yield path
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_drafts(path.parent, glob.escape(path.name))
     draft = draft_of(path)
@@ -487,10 +490,15 @@ def write_atomically(path: Path) -> Iterator[Path]:
         raise
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text in one rename: what was there stays until all of it is written."""
+    with write_atomically(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
     """Write `value` as JSON in one rename; numbers that are not finite are refused (ValueError)."""
-    with write_atomically(path) as draft:
-        draft.write_text(json.dumps(value, indent=indent, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(value, indent=indent, allow_nan=False) + "\n")
 
 
 def draft_of(path: Path) -> Path:

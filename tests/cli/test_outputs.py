@@ -3,6 +3,11 @@ refused by name.
 """
 
 import json
+import os
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,14 +20,26 @@ from mme_vla.envs import metadata
 from mme_vla.errors import SceneError, UserError
 from mme_vla.extras.nano.cli import board
 from mme_vla.extras.nano.fitting import _remove_drafts
+from mme_vla.extras.probing.analyses.cost import ModelCost, write_costs
 from mme_vla.extras.probing.cli.analyse import _beside, _save
 from mme_vla.policy.tensor_files import replace_folder
-from mme_vla.utils import require_replaceable
+from mme_vla.utils import require_replaceable, write_text
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
     paths = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
     return {name: path.read_bytes() if path.is_file() else None for name, path in paths.items()}
+
+
+@contextmanager
+def disk_of(size: int) -> Iterator[None]:
+    """No file takes more bytes meanwhile, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.fixture
@@ -142,6 +159,41 @@ def test_an_earlier_output_and_a_device_are_written_again(tmp_path: Path) -> Non
         require_replaceable(tmp_path, ".html", ".htm")
 
 
+def _results(path: Path) -> None:
+    results._write({path: "page" * 1000})
+
+
+def _analysis(path: Path) -> None:
+    _save(SimpleNamespace(output=path), {"key": "value" * 1000})  # type: ignore[arg-type]
+
+
+def _costs(path: Path) -> None:
+    write_costs([ModelCost(*[1] * len(fields(ModelCost)))] * 100, path)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("capsys")  # in memory, which the limit leaves alone
+@pytest.mark.parametrize(
+    ("write", "name"), [(_results, "page.html"), (_analysis, "a.json"), (_costs, "costs.csv")]
+)
+def test_an_earlier_output_stays_whole_where_the_disk_is_full(
+    write: Callable[[Path], None], name: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text("earlier")
+    with disk_of(1000), pytest.raises(OSError, match="too large"):
+        write(tmp_path / name)
+    assert (tmp_path / name).read_text() == "earlier"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_pipe_is_written_and_stays_one(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_text(pipe, "page")
+    assert (os.read(reader, 100), pipe.is_fifo()) == (b"page", True)
+    os.close(reader)
+
+
 def test_an_analysis_replaces_neither_other_files_nor_one_beside_its_output(tmp_path: Path) -> None:
     records, table = tmp_path / "episodes.jsonl", tmp_path / "figure.csv"
     records.write_text("mine")
@@ -165,6 +217,16 @@ def test_a_tokenizer_of_a_checkpoint_is_not_replaced(
     for _ in range(2):
         train_tokenizer.main([str(tmp_path / "new")])
     assert (tmp_path / "new" / "tokenizer.model").read_bytes() == b"trained"
+
+
+@pytest.mark.usefixtures("capsys")
+def test_a_tokenizer_that_does_not_fit_on_the_disk_leaves_no_part_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_tokenizer, "train_tokenizer", lambda lines: b"trained" * 1000)
+    with disk_of(1000), pytest.raises(OSError, match="too large"):
+        train_tokenizer.main([str(tmp_path)])
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

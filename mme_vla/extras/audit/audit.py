@@ -35,7 +35,7 @@ from mme_vla.extras.probing.recordings import Recording
 from mme_vla.extras.probing.report import ONLINE, require_earlier
 from mme_vla.extras.probing.run import ProbePlan, run_probe
 from mme_vla.policy.base import Policy
-from mme_vla.utils import read_json, to_json, write_atomically, write_json
+from mme_vla.utils import read_json, to_json, write_json, write_text
 
 PAGE, FIGURES, PLAN = "audit.html", "audit.json", "plan.json"
 MARK = "Audit of"  # in the heading of each page
@@ -202,5 +202,4 @@ def _write(card: Card, conclusion: Conclusion, folder: Path, policy: Policy) -> 
     if conclusion.resolution is not None:
         detail = f"losses from {percent(conclusion.resolution)} on can be told"
     page = card_page(card, MARK, verdict, _METHOD, reasons, detail)
-    with write_atomically(folder / PAGE) as draft:
-        draft.write_text(page, encoding="utf-8")
+    write_text(folder / PAGE, page)

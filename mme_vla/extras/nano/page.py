@@ -27,7 +27,7 @@ from mme_vla.extras.nano.evaluating import PLANNER
 from mme_vla.extras.nano.fitting import learning_curve
 from mme_vla.extras.nano.rows import TRAINED
 from mme_vla.extras.nano.settings import NanoRun
-from mme_vla.utils import read_json, write_atomically
+from mme_vla.utils import read_json, write_text
 from mme_vla.utils.pages import render
 from mme_vla.utils.style import figure, legend, log_scale
 
@@ -82,8 +82,7 @@ def write_page(
         curves=CURVES if has_curves else None,
         videos=[(video.stem, video.relative_to(folder)) for video in videos],
     )
-    with write_atomically(folder / PAGE) as draft:
-        draft.write_text(text, encoding="utf-8")
+    write_text(folder / PAGE, text)
     return folder / PAGE
 
 

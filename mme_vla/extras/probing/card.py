@@ -39,7 +39,7 @@ from mme_vla.extras.probing.run import OFFLINE, ProbePlan, run_probe
 from mme_vla.extras.probing.writing import required_frames, score_writing
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.utils import to_json, write_atomically, write_json
+from mme_vla.utils import to_json, write_json, write_text
 from mme_vla.utils.pages import escape_markdown
 
 TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"
@@ -532,8 +532,7 @@ def write_card(card: Card, folder: Path) -> None:
     """Write the page and the JSON."""
     write_json(folder / FIGURES, to_json(asdict(card)))
     page = card_page(card, MARK, conclude_card(card), _METHOD)
-    with write_atomically(folder / PAGE) as draft:
-        draft.write_text(page, encoding="utf-8")
+    write_text(folder / PAGE, page)
 
 
 def card_page(

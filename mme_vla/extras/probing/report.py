@@ -20,7 +20,7 @@ from mme_vla.extras.probing.conclusions import conclude
 from mme_vla.extras.probing.findings import Effect, Findings, by_recording, effect, grouped
 from mme_vla.extras.probing.lines import EntryLine, MomentLine
 from mme_vla.extras.probing.recordings import Recording
-from mme_vla.utils import read_bytes, write_atomically
+from mme_vla.utils import read_bytes, write_text
 from mme_vla.utils.media import Tile, contact_sheet
 from mme_vla.utils.pages import render
 from mme_vla.utils.style import COLOURS, FAINT, INK, figure, legend, rgb, svg
@@ -489,8 +489,7 @@ def write_page(
         notes=[*notes.warnings, *notes.left_out],
     )
     for file, content in ((PAGE, page), (TABLE, text)):
-        with write_atomically(folder / file) as draft:
-            draft.write_text(content, encoding="utf-8")
+        write_text(folder / file, content)
     return folder / PAGE
 
 

@@ -35,6 +35,7 @@ from mme_vla.utils import (
     to_json,
     write_atomically,
     write_sums,
+    write_text,
 )  # fmt: skip
 from mme_vla.utils.media import png_bytes, write_video
 
@@ -169,8 +170,7 @@ def _build_episode(
     # The rows come last: where they exist, their images do.
     for name, built in sets_rows.items():
         lines = [json.dumps(row, ensure_ascii=False) + "\n" for row in built.rows]
-        with write_atomically(_part(output, name, episode)) as draft:
-            draft.write_text("".join(lines), encoding="utf-8")
+        write_text(_part(output, name, episode), "".join(lines))
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:

@@ -7,7 +7,6 @@ The adapter ends up in `<output>/adapter`: `subgoal=qwenvl subgoal.adapter=<outp
 predicts with it.
 """
 
-import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, counted, missing_extra, require
 from mme_vla.subgoal.finetuning.rows import SETS, Collator, RowDataset
 from mme_vla.subgoal.models.qwen3vl import VLM, load_model
+from mme_vla.utils import write_json
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -50,7 +50,7 @@ def write_arguments(folder: Path, name: str) -> Path:
     """
     path = folder / f"swift_{name}.json"
     arguments = {**_ARGUMENTS, "dataset": [f"{name}.jsonl"], "output_dir": f"swift_{name}"}
-    path.write_text(json.dumps(arguments, indent=1) + "\n", encoding="utf-8")
+    write_json(path, arguments, indent=1)
     return path
 
 

@@ -19,7 +19,7 @@ from mme_vla.cli.help import argument_parser
 from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import printable, require
 from mme_vla.extras.nano.settings import NanoRun
-from mme_vla.utils import require_replaceable
+from mme_vla.utils import require_replaceable, write_text
 
 SHIPPED = Path(__file__).resolve().parents[3] / "assets" / "board"
 """The published rows: an archive for each table."""
@@ -179,6 +179,5 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     ]:
         print(printable(line))
     if args.html:
-        args.html.parent.mkdir(parents=True, exist_ok=True)
-        args.html.write_text(board_page.page(board), encoding="utf-8")
+        write_text(args.html, board_page.page(board))
         print(f"wrote {args.html}")

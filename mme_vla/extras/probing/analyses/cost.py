@@ -26,6 +26,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.sections import PolicySections
+from mme_vla.utils import write_atomically
 
 REPLAN = 16  # frames that pass between two chunks of an episode
 
@@ -118,8 +119,7 @@ def on_meta(model: str, budget: int | None = None, backbone: str | None = None) 
 
 def write_costs(costs: list[ModelCost], path: Path) -> None:
     """Write counts as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with write_atomically(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
         columns = [member.name for member in fields(ModelCost)]
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()

@@ -27,7 +27,7 @@ from mme_vla.config.plugins import TRUST_FLAG, import_plugins, plugins_of, trust
 from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError, check_choice, counted, require
 from mme_vla.policy.sections import PolicySections
-from mme_vla.utils import require_replaceable, safe_name
+from mme_vla.utils import require_replaceable, safe_name, write_atomically, write_text
 
 if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
@@ -160,9 +160,9 @@ def recurrence(args: argparse.Namespace) -> None:
                     log.number(f"recurrence/{key}", values[i])
     path = args.output or Path("outputs/analyse") / f"recurrence_{name}.svg"
     table = _beside(path, ".csv")
-    require_replaceable(path, ".svg").parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(recurrence_plot(episode_curves, f"{name} on {source.name}"), encoding="utf-8")
-    with table.open("w", newline="", encoding="utf-8") as file:
+    require_replaceable(path, ".svg")
+    write_text(path, recurrence_plot(episode_curves, f"{name} on {source.name}"))
+    with write_atomically(table) as draft, draft.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["episode", "frame", *episode_curves[0].curves])
         for curves in episode_curves:
@@ -336,9 +336,7 @@ def writing(args: argparse.Namespace) -> None:
     table = writing_table(results)
     print(table)
     if args.output:
-        text = _beside(args.output, ".md")
-        text.parent.mkdir(parents=True, exist_ok=True)
-        text.write_text(table, encoding="utf-8")
+        write_text(_beside(args.output, ".md"), table)
     _save(args, {name: result.to_dict() for name, result in results.items()})
 
 
@@ -415,8 +413,8 @@ def _print(title: str, columns: Sequence[str], rows: list[list[str]]) -> None:
 
 def _save(args: argparse.Namespace, values: dict[str, Any]) -> None:
     if args.output:
-        require_replaceable(args.output, ".json").parent.mkdir(parents=True, exist_ok=True)
-        args.output.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+        require_replaceable(args.output, ".json")
+        write_text(args.output, json.dumps(values, indent=1) + "\n")
         print(f"wrote {args.output}")
 
 
