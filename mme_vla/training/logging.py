@@ -295,7 +295,6 @@ def open_loggers(
 
     A resumed run removes the lines that lie beyond its first step.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     tracker = None
     if section:
         tracker = LOGGERS.build(section, folder, config, first_step=first_step)
