@@ -175,7 +175,7 @@ def _costs(path: Path) -> None:
 @pytest.mark.parametrize(
     ("write", "name"), [(_results, "page.html"), (_analysis, "a.json"), (_costs, "costs.csv")]
 )
-def test_an_earlier_output_stays_whole_where_the_disk_is_full(
+def test_an_earlier_output_stays_where_the_disk_is_full(
     write: Callable[[Path], None], name: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_text("earlier")
@@ -185,7 +185,7 @@ def test_an_earlier_output_stays_whole_where_the_disk_is_full(
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_a_pipe_is_written_and_stays_one(tmp_path: Path) -> None:
+def test_a_pipe_stays_a_pipe(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
@@ -220,7 +220,7 @@ def test_a_tokenizer_of_a_checkpoint_is_not_replaced(
 
 
 @pytest.mark.usefixtures("capsys")
-def test_a_tokenizer_that_does_not_fit_on_the_disk_leaves_no_part_of_it(
+def test_a_tokenizer_larger_than_the_disk_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(train_tokenizer, "train_tokenizer", lambda lines: b"trained" * 1000)
