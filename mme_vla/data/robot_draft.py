@@ -81,10 +81,8 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
     ]
     for camera, column in cameras.items():
         lines += _camera_lines(camera, column, info.features[column])
-    lines.append(
-        f"memory_camera: {_text(next(iter(cameras)))} # {CHECK} the camera whose frames memories"
-        " store"
-    )
+    first = next(iter(cameras))
+    lines.append(f"memory_camera: {_text(first)} # {CHECK} the camera whose frames memories store")
     lines.append("state:")
     lines += _key_lines(state, ("observation.state", "state"))
     lines.append(f"  width: {state_width}")
@@ -98,9 +96,10 @@ def draft_robot(root: Path, info: Info, taken: Sequence[str] = ()) -> RobotDraft
         f"  relative: [{', '.join(map(str, relative))}] # {CHECK} numbers that are positions of the"
         " state's number at the same place; grippers and velocities are not"
     )
+    seconds = HORIZON / info.fps
     lines.append(
-        f"  horizon: {HORIZON} # {CHECK} actions of a chunk, {HORIZON / info.fps:.2g} s at"
-        f" {info.fps:g} frames per second"
+        f"  horizon: {HORIZON} # {CHECK} actions of a chunk, {seconds:.2g} s at {info.fps:g} frames"
+        " per second"
     )
     lines.append(f"  execute: {EXECUTE} # {CHECK} of which so many are executed")
     lines.append(f"fps: {str(info.fps).removesuffix('.0')}")  # all digits: 29.97002997002997
