@@ -134,9 +134,8 @@ class Trainer:
         if run.checkpoint is not None:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
             # The card keeps the last validation's loss until the next one.
-            card = PolicySections.of(read_config(run.checkpoint)).card
-            if "results" in card:
-                self.facts["card"] = {**self.facts.get("card", {}), "results": card["results"]}
+            earlier = PolicySections.of(read_config(run.checkpoint)).card
+            self._add_results(earlier.get("results"))
         # What an update calls: sharded weights exchange gradients themselves, others through DDP.
         self._replicated = policy if self.sharded else accelerator.prepare_model(policy)
         # What a CPU takes for it was not measured.
@@ -290,9 +289,13 @@ class Trainer:
                 self.accelerator.reduce,
             )
         loggers.write(step, {"val/loss": loss})
-        results = {"validation loss": round(loss, 4), "at step": step}
-        self.facts["card"] = {**self.facts.get("card", {}), "results": results}
+        self._add_results({"validation loss": round(loss, 4), "at step": step})
         line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
+
+    def _add_results(self, results: Mapping[str, Any] | None) -> None:
+        """Put the results of a validation on the card of the next checkpoints."""
+        if results is not None:
+            self.facts["card"] = {**self.facts.get("card", {}), "results": results}
 
     def save(self, step: int, stopping: bool = False) -> None:
         """Write a checkpoint: the first process does, or all their parts, which training does not
